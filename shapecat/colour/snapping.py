@@ -71,7 +71,7 @@ def snapped(masks: Sequence[Mask], pixels: U1, scale: float = 1.0) -> tuple[Mask
 
 
 class _Match(NamedTuple):
-    """The window (rows and columns) around a mask, and the pixels in it that match it (h, w)."""
+    """A window (rows and columns) around a mask, and which of its pixels match the mask (h, w)."""
 
     window: tuple[slice, slice]
     wanted: Bool
@@ -98,7 +98,7 @@ def _match(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> _Ma
 
 
 def _claim(match: _Match, number: int, owners: I4) -> Mask:
-    """Return a mask of the pixels that match it and that no other mask has; mark them as taken."""
+    """Give mask ``number`` the matching pixels that no other mask owns; return the new mask."""
     rows, columns = match.window
     part = owners[match.window]
     claimed = match.wanted & ((part == number) | (part == 0))

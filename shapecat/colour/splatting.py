@@ -63,7 +63,10 @@ def splat_depth(
 
 
 def _rays(camera: Camera, colour_from_depth: Pose) -> tuple[F4, F4, F4]:
-    """Return the terms of a rotated ray for each column (3, w) and row (3, h), and a shift (3,)."""
+    """Return the parts of the rays by column (3, w) and by row (3, h), and the translation (3,).
+
+    The ray of a pixel in the colour camera's frame is the sum of its column's and its row's part.
+    """
     x = (np.arange(camera.width) - camera.cx) / camera.fx
     y = (np.arange(camera.height) - camera.cy) / camera.fy
     turn = colour_from_depth.rotation
@@ -86,10 +89,11 @@ def _splat(
     size: tuple[int, int],
     boxes: I4,
 ) -> tuple[int, int, I4]:
-    """Return left, top and labels as `splat_depth` does, and write their boxes to ``boxes``.
+    """Return left, top and labels as `splat_depth` does, and write its ``boxes``.
 
-    ``pixels`` and ``labels`` (n,) are flat depth pixels and their objects; ``scale`` is the colour
-    pixels per depth pixel at equal distance; ``size`` is width and height of the colour image.
+    ``pixels`` and ``labels`` (n,) are flat depth pixels and their objects; ``rays`` are from
+    `_rays`; ``scale`` is the colour pixels per depth pixel at equal distance; ``size`` is width and
+    height of the colour image.
     """
     beside = _list_beside(depth, pixels)
     projections = _project_pixels(depth, pixels, rays, lens)

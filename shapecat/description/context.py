@@ -263,7 +263,7 @@ def _axis(
 
 @kernel(inline=True)
 def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
-    """Write mean, deviation and skew of the height, and the convex fraction of the surface."""
+    """Write mean, deviation and skew of the heights ``level`` (n,), and the convex fraction."""
     mean = second = third = 0.0
     for i in range(level.size):
         mean += weight[i] * level[i]

@@ -79,18 +79,18 @@ def fit_surfaces(
 
     Parameters
     ----------
-    points, starts : from `assign`.
+    points, starts : (3, n) points sorted by neuron, and (k + 1,) where each begins, from `assign`.
     x, y, z : (k,) positions of the neurons.
     euclidean : (k, k) Euclidean distances between the neurons.
-    radius : radius of the neighbourhoods, in the same unit.
-    eye : (3,) position of the sensor.
+    radius : radius of the neighbourhoods, in the unit of the positions.
+    eye : (3,) position of the sensor, in the frame of the points.
 
     Returns
     -------
     normals : (3, k) unit vectors that point to the sensor's side.
     curvatures : (2, k) largest and smallest principal curvature, 1 / length; positive where the
-        surface bulges towards the sensor. They are clipped to ``4 / radius`` either way, the most
-        that a neighbourhood can show, and 0 with fewer than 6 points in it.
+        surface bulges towards the sensor. They are clipped to ±``4 / radius``, the most that a
+        neighbourhood can show, and 0 if it has fewer than 6 points.
     """
     count, total = x.size, points.shape[1]
     normals = np.zeros((3, count), np.float32)

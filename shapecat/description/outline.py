@@ -84,7 +84,12 @@ def _widths(
     to_narrow: bool,  # noqa: FBT001  compiled kernels take their arguments by position
     out: F4,
 ) -> tuple[float, float]:
-    """Write width and offset of each slice; return the relative length, and the filled fraction."""
+    """Write width and offset of each slice to ``out``, relative to the largest width.
+
+    ``along`` and ``across`` (n,) are coordinates of the points; slices divide ``along``. With
+    ``to_narrow``, they go from the wide to the narrow end. Returns length / (length + largest
+    width), and the mean width divided by the largest.
+    """
     low, high = inner_range(along)
     length = max(high - low, 1e-6)
     left, right = np.zeros(OUTLINE_SLICES), np.zeros(OUTLINE_SLICES)

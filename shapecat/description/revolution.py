@@ -220,11 +220,11 @@ def _move(axis: F8, point: F8, first: F8, second: F8, move: F8, farthest: float)
 def _measure(
     cloud: F4, owner: I4, normals: F4, axis: F8, point: F8, slices: F8
 ) -> tuple[float, float, float]:
-    """Write the profile of all points about an axis, one row of ``slices`` per slice.
+    """Write the profile of all points about an axis, one row of ``slices`` (k, 4) per slice.
 
-    A row is the fraction of the points, the mean radius, the deviation from it, and the fraction of
-    the points that face the axis. Returns the root mean square residual, the length along the axis,
-    and the mean radius.
+    A row is the slice's fraction of all points, the mean radius, the standard deviation from it,
+    and the fraction of its points that face the axis. Returns the root mean square of the
+    deviations in all slices, the length along the axis, and the mean radius.
     """
     first, second = _across(axis)
     rows, extent = _place(cloud, owner, normals, axis, point, first, second)

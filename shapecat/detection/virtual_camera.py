@@ -107,9 +107,10 @@ def top_view(
 
 
 def _dominant_plane(sample: F8, hint: F8 | None, rng: np.random.Generator) -> F8 | None:
-    """Return the normal (3,) on the upper side of the plane with the most inliers, by RANSAC.
+    """Return the upward normal (3,) of the plane with the most inliers, by RANSAC.
 
-    ``sample`` (n, 3) are points, metres; the result and ``hint`` are as in `top_view`.
+    None if there is no plane. ``sample`` (n, 3) are points, metres; ``hint`` and the upper side are
+    as in `top_view`.
     """
     a, b, c = sample[rng.integers(0, len(sample), (3, 200))]
     normal = np.cross(b - a, c - a)

@@ -118,9 +118,9 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U
 
 @kernel(inner=True)
 def _normalise(points: F4) -> tuple[Cloud, F8]:
-    """Return at most `_MAX_POINTS` points, scaled to -1 to 1, and the frame (4,) to undo it.
+    """Return at most `_MAX_POINTS` points, scaled to -1 to 1, and four numbers to undo it.
 
-    The frame is x, y, z of the mean, and the largest distance from it along an axis.
+    These are x, y, z of the mean, and the largest distance from it along an axis.
     """
     step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
     size = (points.shape[0] + step - 1) // step

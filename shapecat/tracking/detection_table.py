@@ -125,7 +125,7 @@ class DetectionTable:
     def positions(self, track: I4, rows: I4) -> F8:
         """Return the positions (k, 3) of a track in frames ``rows`` (k,), metres.
 
-        They are linear in time between its detections, ``track`` (d,).
+        They are interpolated linearly in time between its detections, ``track`` (d,).
         """
         if len(rows) == 0:
             return np.zeros((0, 3))
@@ -144,7 +144,7 @@ class DetectionTable:
 
         Also returns a mask (k,) of those with a detection.
 
-        Gaps longer than ``max_gap_s`` are left out, and so are topics that never see it.
+        Gaps longer than ``max_gap_s`` are left out, and so are topics that never see the object.
         """
         frames = self.rows[track]
         gap_s = np.diff(self.stamps_ns[frames]) * 1e-9
@@ -230,7 +230,7 @@ def _by_time(topics: I4, stamps_ns: I4) -> Any:
 
 
 def _times_set_back(stamps_ns: I4) -> I4:
-    """Return how often a clock had been set back at each frame (f,), ignoring single odd stamps.
+    """Return how often a clock had been set back at each frame (f,), ignoring single wrong stamps.
 
     To ignore these, the two frames before are compared with this one and the next.
     """

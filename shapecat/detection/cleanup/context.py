@@ -41,13 +41,13 @@ def measure_borders(segments: Segments, roots: I4) -> F4:
 
 
 def add_context(features: Records, logits: F4, weights: F4) -> Records:
-    """Return the `CONTEXT_FEATURES` (r,) of the merged segments of a frame.
+    """Return the `CONTEXT_FEATURES` of the merged segments of a frame, as records (r,).
 
     Parameters
     ----------
-    features : (r,) `OBJECT_FEATURES`.
-    logits : (r,) log-odds that a segment is an object, each classified alone.
-    weights : (4, r, r) from `measure_borders`.
+    features : (r,) `OBJECT_FEATURES` of the segments.
+    logits : (r,) log-odds that each segment is an object, classified without its neighbours.
+    weights : (4, r, r) lengths of the borders, by kind, from `measure_borders`.
     """
     records = np.zeros(len(features), CONTEXT_FEATURES)
     records["object"], records["logit"] = features, logits

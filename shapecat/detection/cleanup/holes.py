@@ -86,10 +86,11 @@ def _count_sides(
     total: I4,
     area: I4,
 ) -> None:
-    """Count the sides of holes, by label (n, labels, 3) and in ``total`` (n,), and their cells.
+    """Count the sides and cells of the holes, in place.
 
-    Cells without depth beside a hole are part of its ``area`` (n,), and the label behind them is
-    its neighbour. Open sides count only in the total.
+    ``sides`` (n, labels, 3) holds the counts `BOUNDARY`, `IN_FRONT` and `CONTINUOUS` of the sides
+    with each label; ``total`` (n,) also counts open sides. ``area`` (n,) counts cells: those
+    without depth beside a hole belong to it, and the label behind them is its neighbour.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     for i in range(len(spans)):

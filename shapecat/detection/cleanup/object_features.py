@@ -73,9 +73,10 @@ def measure_object_features(
     oversegmentation: OverSegmentation,
     range_m: float,
 ) -> Records:
-    """Return the `OBJECT_FEATURES` (n + 1,) of merged segments; zeros for merged parts.
+    """Return the `OBJECT_FEATURES` (n + 1,) of merged segments.
 
-    ``range_m`` is the range limit, metres.
+    Rows of segments that were merged into another are zeros. ``range_m`` is the range limit,
+    metres.
     """
     features = np.zeros(oversegmentation.segments.parent.size, OBJECT_FEATURES)
     limits = Limits(*_border_lines(grid), 1 / range_m + DISCONTINUITY / 2)

@@ -57,7 +57,7 @@ def find_low_profile(
     ----------
     heights : ``plane_id`` is changed in place: k + 1 for objects on plane k; -(k + 1) for samples
         of plane k that only depth error lifts off it.
-    planes : from `pack_planes`.
+    planes : (planes,) records of `PLANE`, from `pack_planes`.
     max_size_m : maximum width of a low-profile object, metres.
 
     Returns

@@ -57,7 +57,7 @@ def extend_overhang(
     Parameters
     ----------
     heights : changed in place.
-    planes : from `pack_planes`.
+    planes : (planes,) records of `PLANE`, from `pack_planes`.
     walls : (rows, columns) from `remove_walls`; cleared cells are not assigned.
     max_height_m : maximum height of an object above its plane, metres.
     """

@@ -37,7 +37,7 @@ def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, max_size_m: float, trial
     plane_id : (rows, columns) as in `HeightMap`; cleared cells become 0.
     up : (3,) unit vector, sensor frame.
     max_size_m : size of the largest object, metres.
-    trials : from `draw_trials`.
+    trials : (n, 3) random numbers from `draw_trials`.
 
     Returns
     -------

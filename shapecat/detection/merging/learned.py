@@ -71,9 +71,10 @@ def _rate(
     pair: Records,
     logits: F8,
 ) -> None:
-    """Write the logits of ``p`` paired with segments from ``first`` on; the smaller is the row.
+    """Write the logits that ``p`` is one object with each segment from ``first`` on.
 
-    ``pair`` (1,) is work space for the features of a pair, which the trees read as numbers.
+    In ``logits`` (n + 1, n + 1), the smaller segment is the row; -inf if not adjacent. ``pair``
+    (1,) is work space for the features of a pair, which the trees read as numbers.
     """
     adjacent, values = find_adjacent(segments, p, view_geometry), pair.view(np.float32)
     for q in range(first, adjacent.size):

@@ -99,7 +99,7 @@ def _select_objects(
     *,
     image: bool,
 ) -> list[int]:
-    """Return the lists with enough points for an object, in the order of their first points."""
+    """Return which lists in ``indices`` have enough points for an object, by their first points."""
     limits = [float(min_points)] * len(indices)
     if image:
         limits = [max(min_points, n * grid.factor**2) for n in measured.min_cells.tolist()]

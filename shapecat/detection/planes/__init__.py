@@ -27,7 +27,7 @@ def find_supporting_planes(
     Parameters
     ----------
     hint : (3,) unit vector away from gravity, sensor frame; None if unknown.
-    trials : from `draw_trials`.
+    trials : (n, 3) random numbers from `draw_trials`.
     max_height_m : height of the tallest object, metres.
     upright : whether the grid is from a real camera, which is rarely held on its side.
 

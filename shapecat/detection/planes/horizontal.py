@@ -99,7 +99,7 @@ def fit_peaks(
     ----------
     samples, heights : the samples and their heights, from `level_samples`.
     up : (3,) unit vector, sensor frame.
-    trials : from `draw_trials`.
+    trials : (n, 3) random numbers from `draw_trials`.
     """
     planes: list[F8] = []
     rest = np.stack([samples.j, samples.i, samples.inverse_depth, heights])

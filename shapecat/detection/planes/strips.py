@@ -42,7 +42,7 @@ height of a strip."""
 def may_have_strips(
     grid: DepthGrid, points: OrientedPoints, candidates: list[PlaneCandidate]
 ) -> bool:
-    """Return whether some height has many points with few below it, and so may have strips.
+    """Return whether there is a height with many points, but few below it, as where strips are.
 
     ``candidates`` are parallel planes, at least one.
     """

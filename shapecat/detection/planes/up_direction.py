@@ -38,7 +38,7 @@ def estimate_up(
     ----------
     hint : (3,) unit vector, sensor frame: only normals within 15 degrees of it are considered.
         Zeros if up is unknown.
-    trials : from `draw_trials`.
+    trials : (n, 3) random numbers from `draw_trials`.
     roll_penalty : penalty on directions that imply a camera on its side or upside down:
         `UpSettings.roll_penalty`, or 0 if the camera may be held in any way.
     """
@@ -233,10 +233,10 @@ def _large_levels(count: F8, areas: F8, min_weight: float) -> tuple[float, float
 
 @kernel(inner=True)
 def _count_levels(surface: F4, direction: F8, bins: int) -> tuple[F8, F8, float, float]:
-    """Sum the weights of the points that face a direction, by their height below the sensor.
+    """Sum the weights of the points that face a direction, in bins of height below the sensor.
 
-    Returns the weight and the area, m2, in each bin, (bins,) each, the sum of the weights over the
-    bins, and the weight of all points.
+    ``surface`` (8, n) is from `_every_second`. Returns the weight (bins,) and the area (bins,), m2,
+    in each bin; the sum of the weights in all bins; and the weight of all points.
     """
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     nx, ny, nz, weights = surface[0], surface[1], surface[2], surface[6]

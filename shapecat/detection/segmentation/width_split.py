@@ -160,7 +160,7 @@ def _step_at(outlines: Outlines, p: int, band: int) -> float:
 
 @kernel(inner=True)
 def _second(end: F4, k: int, sign: float) -> float:
-    """Return the second largest of four values times ``sign``: spurs one band high are noise."""
+    """Return the second largest of ``sign * end[k : k + 4]``: a spur one band high is noise."""
     a, b, c, d = sign * end[k], sign * end[k + 1], sign * end[k + 2], sign * end[k + 3]
     return float(max(min(max(a, b), max(c, d)), min(a, b), min(c, d)))
 
