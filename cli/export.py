@@ -13,8 +13,8 @@ from .options import ANY_PATH, boxes_option, recording_option
 from .render import for_any_reader, progress_bars
 
 _DATASETS = ("coco", "yolo")
-_WITH_BOXES = ("kitti", "labelcloud")
-_FORMATS = (*_DATASETS, "crops", *_WITH_BOXES, "point-labels")
+_BOX_FORMATS = ("kitti", "labelcloud")
+_FORMATS = (*_DATASETS, "crops", *_BOX_FORMATS, "point-labels")
 _NO_VAL = (
     "all frames of a recording go to the same split; export more recordings, or raise --val if "
     "there are several"
@@ -112,8 +112,8 @@ def export(
         _require_distinct_frames(runs)
     else:
         _require_distinct_names(runs)
-    if boxes is not None and kind not in _WITH_BOXES:
-        msg = f"--boxes is for --format {' and '.join(_WITH_BOXES)}, not {kind}"
+    if boxes is not None and kind not in _BOX_FORMATS:
+        msg = f"--boxes is for --format {' and '.join(_BOX_FORMATS)}, not {kind}"
         raise click.UsageError(msg)
     if kind in _DATASETS:
         _export_dataset(runs, kind, out, recording, {"every": every, **chosen})

@@ -192,5 +192,13 @@ def changed(settings: Any) -> Any:
         elif kind is bool:
             values[name] = not value
         else:
-            values[name] = value + 1 if kind is int else 2 * value or 0.1
+            others = (value + 1,) if kind is int else (2 * value, 0.1, 1.0)
+            values[name] = next(other for other in others if accepts(settings, name, other))
     return dataclasses.replace(settings, **values)
+
+
+def accepts(settings: Any, name: str, value: float) -> bool:
+    """Return whether a setting may have another value, alone."""
+    with suppress(ConfigError):
+        return bool(dataclasses.replace(settings, **{name: value}) != settings)
+    return False

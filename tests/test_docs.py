@@ -15,6 +15,7 @@ from click.testing import Result
 from shapecat import config
 from shapecat.config import Settings, with_overrides
 from shapecat.errors import ConfigError
+from shapecat.outputs.exports import formats
 from shapecat.runs.tables.schemas import TABLES
 
 ROOT = Path(__file__).parents[1]
@@ -54,7 +55,9 @@ def test_root_help_truncates_no_description(shapecat: Callable[..., Result]) -> 
     assert "..." not in shapecat("--help").stdout.partition("Commands:")[2]
 
 
-@pytest.mark.parametrize(("command", "option"), [("simulate", "scene"), ("export", "kind")])
+@pytest.mark.parametrize(
+    ("command", "option"), [("simulate", "scene"), ("simulate", "sensor"), ("export", "kind")]
+)
 def test_help_explains_each_choice(
     shapecat: Callable[..., Result], command: str, option: str
 ) -> None:
@@ -83,6 +86,12 @@ def test_command_offers_what_the_library_has(
 
     names = set(getattr(import_module(registry[0]), registry[1])) - {"empty"}  # a scene of tests
     assert names <= set(choice.choices)
+
+
+def test_command_knows_the_formats_with_boxes() -> None:
+    """A format missing here would be exported with visible boxes, although help says full."""
+    command = import_module("shapecat.cli.export")
+    assert set(command._BOX_FORMATS) == set(formats.BOX_FORMATS)
 
 
 def documented_commands() -> list[tuple[str, str]]:
@@ -141,6 +150,7 @@ def test_reference_lists_every_setting_with_default() -> None:
         len(group) for group in Settings().as_dict().values() if isinstance(group, dict)
     )
     assert len(expected) == count, "a setting without a docstring"
+    assert {name for name, *_ in expected} <= found.keys(), "docs/reference.md lacks settings"
     for name, default, meaning in expected:
         assert [found[name][0], found[name][2]] == [default, meaning]
 

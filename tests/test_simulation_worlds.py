@@ -24,7 +24,7 @@ from shapecat.simulation.camera.render import geometry, render
 from shapecat.simulation.camera.sensors import resized
 from shapecat.simulation.containers import FormatName
 from shapecat.simulation.recorder import EPOCH_NS, record, robot_links
-from shapecat.simulation.scenes.kinds import SceneKind
+from shapecat.simulation.scenes.kinds import SCENES, SceneKind
 from shapecat.simulation.shapes.mesh import Mesh
 from shapecat.simulation.shapes.scans import load_mesh, uprighted
 from shapecat.simulation.shapes.stable_poses import stable_poses
@@ -34,6 +34,11 @@ from shapecat.types import CATEGORIES, Camera, Pose
 SETTLED = {"pile", "bin", "shelf_bin", "room"}  # with physics: objects touch and lie in each other
 SHARE_IN_VIEW = {"walking": 0.3, "rows": 0.3}  # a counter longer than the view; hidden rows
 KINDS: tuple[SceneKind, ...] = tuple(k for k in get_args(SceneKind) if k not in SETTLED)
+
+
+def test_every_scene_is_a_kind() -> None:
+    """The tests below go through the kinds."""
+    assert set(get_args(SceneKind)) == SCENES.keys()
 
 
 WORLDS = [

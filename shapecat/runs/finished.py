@@ -49,7 +49,10 @@ class FinishedRun:
         return read_labelled_frames(self.folder, self.labels)
 
     def frames_with_full_boxes(self) -> Iterator[LabelledFrame]:
-        """Read the labelled frames; their boxes are full boxes where these are known."""
+        """Read the labelled frames; their boxes are full boxes where these are known.
+
+        ``height_m`` stays the height of the visible box.
+        """
         for frame in self.frames():
             objects = (replace(item, box=item.full or item.box) for item in frame.objects)
             yield replace(frame, objects=tuple(objects))

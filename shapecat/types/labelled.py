@@ -20,7 +20,8 @@ class LabelledObject(Record):
     indices : (n,) ascending indices into the frame.
     posterior : (c,) from this view alone.
     causal : (c,) fused from the track's views up to this frame.
-    height_m : height of the box centre above the surface it stands on; NaN if that is unknown.
+    height_m : height of the visible box's centre above the surface the object stands on; NaN if
+        that is unknown.
     touches_border, occluded : as in `Candidate`.
     detections : numbers of its detections in the frame; several if tracks were merged.
     full : the box of the whole object, estimated from the track's views; None if unknown.

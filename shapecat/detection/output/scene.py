@@ -55,16 +55,14 @@ def build_scene(
     truncated |= measured.at_range_limit
     selected = _select_objects(grid, measured, indices, settings.min_points, image=points is None)
     boxes = _boxes(segmentation, indices, points, sensor_from_view)
-    # Without a visible plane below it, an object cut off by the border is probably furniture.
-    selected = [
-        k
-        for k in selected
-        if (
-            plane_id[k] is not None or not truncated[k]
-            if k < visible_count
-            else _fits(boxes[k], settings)
-        )
-    ]
+
+    def is_object(k: int) -> bool:
+        if k >= visible_count:
+            return _has_object_size(boxes[k], settings)
+        # Without a visible plane below it, what the border cuts off is probably furniture.
+        return plane_id[k] is not None or not truncated[k]
+
+    selected = [k for k in selected if is_object(k)]
     position = {k + 1: n for n, k in enumerate(selected)}
     candidates = []
     for k in selected:
@@ -107,8 +105,11 @@ def _select_objects(
     return sorted(selected, key=lambda k: int(indices[k][0]))
 
 
-def _fits(box: Box, settings: DetectionSettings) -> bool:
-    """Return whether a box has the size of an object, not of a wall or furniture."""
+def _has_object_size(box: Box, settings: DetectionSettings) -> bool:
+    """Return whether a hidden object has the size of one, not of a wall or furniture.
+
+    `find_background` checks the others.
+    """
     length, width, height = box.size.tolist()
     low = height <= settings.max_height_m - CUT_OFF_M
     return bool(low and max(length, width) <= settings.max_size_m)

@@ -34,9 +34,18 @@ from shapecat.system.files import flush, replacing
 from shapecat.system.progress import Observer, ignore, observed
 from shapecat.types import LabelledFrame
 
-__all__ = ["FORMATS", "Exported", "common_categories", "export_dataset", "export_run"]
+__all__ = [
+    "BOX_FORMATS",
+    "FORMATS",
+    "Exported",
+    "common_categories",
+    "export_dataset",
+    "export_run",
+]
 
 Write = Callable[[Path, Iterable[ExportedFrame], FinishedRun], int]
+"""Writes the frames of a run, each with its depth and colour images, into a folder; returns the
+number of objects written."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +70,8 @@ FORMATS: dict[str, Write] = {
     "labelcloud": write_labelcloud,
     "point-labels": write_point_labels,
 }
-_WITH_BOXES = ("kitti", "labelcloud")
+BOX_FORMATS = ("kitti", "labelcloud")
+"""Formats with boxes, which are full or visible; `shapecat export` repeats the names."""
 _MARK = "export.json"
 
 
@@ -107,7 +117,7 @@ def export_run(
     finished = replace(read_finished(folder), common=tuple(categories))
     total = int(finished.info["counts"]["frames"])
     with open_source(finished.info, recording) as source:
-        full = format in _WITH_BOXES and not visible_boxes
+        full = format in BOX_FORMATS and not visible_boxes
         frames = finished.frames_with_full_boxes() if full else finished.frames()
         labelled = observed(frames, "export", total, observe)
         wanted = _tracked(thinned(labelled, every), streams_with_poses(folder))

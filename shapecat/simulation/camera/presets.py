@@ -222,7 +222,7 @@ PRESETS = {
     "l515": _L515,
     "phone": _PHONE,
 }
-"""Real depth cameras by name."""
+"""Real depth cameras by name. Append new ones: the order decides the sensors of training frames."""
 
 SENSORS = {"ideal": IDEAL, **PRESETS}
 """All sensors by name."""

@@ -23,7 +23,8 @@ class Support(Record):
     Attributes
     ----------
     name : unique in its world.
-    label : pixel label, 1 to 9.
+    label : pixel label, 1 to 9; unique among supports that hold objects, or the ground truth counts
+        their pixels together.
     mesh : metres, world frame.
     outline : (k, 3) corners of its horizontal surface, metres, world frame; none, the default,
         if nothing can stand on it, as on a wall.
