@@ -81,7 +81,8 @@ def _whole(table: DetectionTable, track: I4) -> F8:
 def _neighbours(table: DetectionTable, owner: I4, block: slice) -> I4:
     """Return the pairs (p, 2) of tracked detections in the same frame that are near each other."""
     tracked = block.start + np.flatnonzero(owner[block] >= 0)
-    positions = np.column_stack([table.centers[tracked], table.rows[tracked]])
+    frames = 2 * _NEAR_M * table.rows[tracked]  # no detection is near one of another frame
+    positions = np.column_stack([table.centers[tracked], frames])
     near = cKDTree(positions).query_pairs(_NEAR_M, output_type="ndarray")
     pairs = tracked[near]
     return np.asarray(pairs[np.lexsort(pairs.T)])
