@@ -112,6 +112,26 @@ def test_kitti_calibration_projects_points_to_pixels(tmp_path: Path) -> None:
     assert (points[:, 3] == 0).all()
 
 
+@pytest.mark.parametrize(("pitch", "roll"), [(62, 6), (-55, 10), (12, 95), (8, -100), (5, 176)])
+def test_kitti_frame_of_depth_image_looks_along_its_camera(
+    tmp_path: Path, pitch: float, roll: float
+) -> None:
+    """Steep and portrait cameras were taken for laser scanners, which look along x."""
+    level_from_sensor = Rotation.from_euler("x", -pitch, degrees=True) * Rotation.from_euler(
+        "z", roll, degrees=True
+    )
+    up = level_from_sensor.inv().apply([0, -1, 0])
+    seen = replace(labelled(cut=False, hidden=False), up=up)
+    views: Any = [(seen, frame(), None)]
+    unused: Any = SimpleNamespace()
+    write_kitti(tmp_path, views, unused)
+
+    level = level_from_sensor.apply(frame().xyz())  # x right, y down, z forward
+    assert_allclose(read_points(tmp_path)[:, :3], level[:, [2, 0, 1]] * [1, -1, -1], atol=1e-5)
+    place = np.add(level_from_sensor.apply(seen.objects[0].box.center), [0, SIZE[2] / 2, 0])
+    assert_allclose(read_labels(tmp_path)[0].place, place, atol=1e-5)
+
+
 def test_kitti_calibration_projects_points_into_colour_camera(tmp_path: Path) -> None:
     """P2 contains the pose of the camera, and the 2D box is in its pixels."""
     camera = Camera(200, 150, 171.0, 166.0, 103.2, 71.5)
