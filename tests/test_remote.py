@@ -655,6 +655,39 @@ def test_only_one_process_claims_a_folder(url: str, monkeypatch: pytest.MonkeyPa
     assert files(url.removesuffix("/run")) == set()
 
 
+@pytest.mark.parametrize("request_", ["read", "write"])
+def test_claim_is_renewed_after_a_refused_heartbeat(
+    monkeypatch: pytest.MonkeyPatch, request_: str
+) -> None:
+    """After a short outage, another machine would do the same recording again."""
+    works, refusals, renewed = getattr(Location, request_), [OutputError("403")], threading.Event()
+
+    def ask(self: Location, *content: bytes) -> Any:
+        if refusals:
+            raise refusals.pop()
+        renewed.set()
+        return works(self, *content)
+
+    monkeypatch.setattr(claims, "_HEARTBEAT_S", 0.01)
+    monkeypatch.setattr(Location, request_, ask)
+    with claimed("memory://refused/run", "one"):
+        assert renewed.wait(60)
+
+    assert files("memory://refused") == set()
+
+
+@pytest.mark.parametrize("request_", ["read", "remove"])
+def test_claim_that_cannot_be_removed_goes_stale(
+    monkeypatch: pytest.MonkeyPatch, request_: str
+) -> None:
+    """A refused request at the very end made a complete run fail."""
+    with claimed(f"memory://left-{request_}/run", "one"):
+        monkeypatch.setattr(Location, request_, fail)
+    monkeypatch.undo()
+
+    assert files(f"memory://left-{request_}") == {".run.claim"}
+
+
 @pytest.mark.parametrize("content", [b"5", b"[" * 100_000])
 def test_damaged_claim_is_taken_over(monkeypatch: pytest.MonkeyPatch, content: bytes) -> None:
     """Nobody renews it."""
