@@ -106,6 +106,16 @@ def test_smoothing_within_voxels_is_refused() -> None:
         with_overrides(Settings(), ["surface.smooth_radius_m=0.003"])
 
 
+def test_smoothing_radius_of_one_and_a_half_voxels_is_accepted() -> None:
+    """Quotients of decimal fractions round to just below 1.5, as 0.018 / 0.012 does."""
+    for tenths in range(1, 201):
+        voxel_m, just, below = (round(tenths * k * 1e-4, 7) for k in (1, 1.5, 1.49))
+        given = {"voxel_m": voxel_m, "smooth_radius_m": just}
+        assert with_settings(Settings(), {"surface": given}).surface.smooth_radius_m == just
+        with pytest.raises(ConfigError):
+            with_settings(Settings(), {"surface": {**given, "smooth_radius_m": below}})
+
+
 def test_settings_that_fit_together_may_be_given_in_any_order() -> None:
     overrides = ["surface.smooth_radius_m=0.0045", "surface.voxel_m=0.003"]  # just in the range
 

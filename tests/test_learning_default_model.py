@@ -25,16 +25,17 @@ from shapecat.models.arrangements import (
 )
 from shapecat.models.card import write_card
 from shapecat.models.fragments import cut_fragment, remove_base
-from shapecat.models.sets import SimulatedViews, collect, partial_views
+from shapecat.models.sets import SimulatedViews, collect, options_of, partial_views
 from shapecat.models.simulated_views import (
     describe_arrangement,
     simulate_arrangement,
     simulate_views,
 )
 from shapecat.simulation.scenes import physics, piles
-from shapecat.simulation.shapes.distractors import make_distractor
+from shapecat.simulation.shapes.distractors import DISTRACTORS, make_distractor
 from shapecat.simulation.shapes.mesh import Mesh, moved
 from shapecat.simulation.shapes.primitives import rounded_box
+from shapecat.simulation.shapes.procedural import PROCEDURAL
 from shapecat.types import CATEGORIES, Pose
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -171,6 +172,19 @@ def test_training_uses_only_given_kinds_of_distractors(
 
     assert {item.label for item in objects} == {"unknown"}
     assert set(made) == {"pan", "hammer"}
+
+
+def test_test_set_shares_no_distractors_with_the_other_sets() -> None:
+    """A model that has trained on the unknown shapes of its test would seem to know them."""
+    sets = {name: options_of(name) for name in ("training", "calibration", "test")}
+    training, calibration, test = (set(options.kinds) for options in sets.values())
+
+    assert test.isdisjoint(training | calibration)
+    assert training == calibration | set(PROCEDURAL)
+    assert calibration | test == set(DISTRACTORS)
+    assert len(calibration) > len(test) > 6
+    assert len({options.seed for options in sets.values()}) == 3
+    assert sets["test"].seed >= 100_000 > max(sets["training"].seed, sets["calibration"].seed)
 
 
 def test_thin_background_gives_unknown_views() -> None:

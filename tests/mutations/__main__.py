@@ -30,7 +30,7 @@ LIBRARIES = ("numba", "scipy.spatial.transform", "pyarrow.parquet", "rosbags.typ
 PACKAGES = ("batch", "cameras", "cli", "colour", "completion", "depth_fusion", "evaluation",
             "executors", "learning", "outputs", "recordings", "reuse", "runs", "system",
             "tracking")  # fmt: skip
-FILES = ("perception", "pipeline")
+FILES = ("config", "models.sets", "perception", "pipeline")
 """Modules beside the packages."""
 JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.batch": ("test_batch_planning",),
@@ -53,6 +53,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.cli.progress": ("test_commands_worked", "test_command_line", "test_batch"),
     "shapecat.cli.report": ("test_report", "test_report_serve"),
     "shapecat.colour": ("test_colour", "test_colour_outputs", "test_exports_images"),
+    "shapecat.config": ("test_config",),
     "shapecat.completion": ("test_completion", "test_tables_rotated"),
     "shapecat.depth_fusion": ("test_depth_fusion",),
     "shapecat.evaluation": ("test_evaluation", "test_evaluation_dataset"),
@@ -61,6 +62,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.evaluation.comparison.overlap": ("test_compare", "test_identities"),
     "shapecat.executors": ("test_executors", "test_batch"),
     "shapecat.learning": ("test_learning", "test_learning_model_file"),
+    "shapecat.models.sets": ("test_learning_default_model",),
     "shapecat.outputs": ("test_outputs_worked", "test_annotations_rotated",
                          "test_annotated_mcap", "test_exports_worked"),
     "shapecat.outputs.annotation.annotated_mcap": ("test_outputs_worked", "test_annotated_mcap",
@@ -167,7 +169,7 @@ def modules(only: str) -> dict[str, Path]:
         ".".join(("shapecat", package, *file.relative_to(folder).with_suffix("").parts)): file
         for package, folder in folders.items()
         for file in folder.rglob("*.py")
-    } | {f"shapecat.{name}": ROOT / "shapecat" / f"{name}.py" for name in FILES}
+    } | {f"shapecat.{name}": ROOT / "shapecat" / f"{name.replace('.', '/')}.py" for name in FILES}
     return {
         name: file
         for name, file in named.items()
