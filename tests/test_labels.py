@@ -621,7 +621,6 @@ def test_any_text_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, t
 def write_run(folder: Path) -> None:
     """Write three frames with two objects side by side, tracks 1 and 2; track 3 continues 2."""
     plane = Plane(np.array([0, -1, 0]), -0.5, np.zeros((3, 3)), 1.0, 0.0)
-    gas = NeuralGas(np.zeros((3, 3)), np.array([[0, 1], [1, 2]]))
     with PerceptionTables(folder, categories=("cup", "can"), model_id="m") as tables:
         for index in range(3):
             found = tuple(
@@ -635,9 +634,9 @@ def write_run(folder: Path) -> None:
                         touches_border=k == 1,
                         occluded=k == 1,
                     ),
-                    gas,
+                    NeuralGas(np.full((3, 3), k), np.array([[0, 1], [1, 2]])),
                     np.zeros(2),
-                    np.array([1.0 - k, k]),
+                    np.array([0.9 - 0.6 * k, 0.1 + 0.6 * k]),
                     0.5,
                     0.0,
                 )
@@ -676,6 +675,8 @@ def test_merged_parts_of_one_frame_become_one_object(tmp_path: Path) -> None:
     assert np.allclose(np.sort(item.box.size), [0.1, 0.2, 0.3], atol=1e-5)
     assert item.height_m == pytest.approx(0.1, abs=1e-5)
     assert item.gas.edges.tolist() == [[0, 1], [1, 2], [3, 4], [4, 5]]
+    assert item.gas.neurons[:, 0].tolist() == [0, 0, 0, 1, 1, 1]
+    assert item.posterior == pytest.approx([0.6, 0.4])  # their mean
     assert (item.touches_border, item.occluded) == (True, True)  # only the second part is
     assert item.detections == (0, 1)
 

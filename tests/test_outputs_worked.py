@@ -852,10 +852,11 @@ def point_labels(out: Path) -> int:
     depth = np.array([[0.5004, 1.2346, 65.5354], [70.0, 0.0, 65.536]], np.float32)
     camera = Camera(3, 2, 143.0, 139.0, 1.25, 0.75)
     image = Frame("/depth", 4, 5, 6, "cam", depth, camera)
-    points = np.array([[1, 2, 3], [np.nan, 0, 0], [4, 5, 6], [7, 8, np.inf]], np.float32)
+    none = [np.nan, 0, 0]
+    points = np.array([none, [1, 2, 3], none, [4, 5, 6], [7, 8, np.inf]], np.float32)
     cloud = Frame("/scan", 9, 7, 8, "laser", points=points)
     cup, box = labelled_object(3, [0, 5]), labelled_object(300, [2], category="box")
-    scanned = labelled_frame(9, replace(box, indices=np.array([1, 2])), topic="/scan")
+    scanned = labelled_frame(9, replace(box, indices=np.array([0, 3])), topic="/scan")
     frames = [
         (replace(labelled_frame(4, cup, box), stamp_ns=5), image, None),
         (replace(scanned, stamp_ns=7), cloud, None),
