@@ -1152,6 +1152,13 @@ def test_filled_polygon_has_its_area() -> None:
     assert not mask[30, 30]
 
 
+def test_filled_polygon_has_pixels_with_their_centre_inside() -> None:
+    """Half a pixel is lost or gained at each side if the corner of a pixel counts instead."""
+    mask = filled_polygon(np.array([[1.4, 0.6], [4.6, 0.6], [4.6, 3.4], [1.4, 3.4]]), 5, 7)
+
+    assert np.argwhere(mask).tolist() == [[row, column] for row in (1, 2) for column in range(1, 5)]
+
+
 def test_kitti_boxes_of_tilted_camera_survive_export_and_reading(
     shapecat: Run, guessed_run: Path, tmp_path: Path
 ) -> None:

@@ -27,7 +27,7 @@ from shapecat.outputs.report.pictures import (
     _strip_frame,
 )
 from shapecat.outputs.report.surfaces import Snapshot, SurfaceDrawing, draw
-from shapecat.outputs.report.tracks import Timeline, read_timelines
+from shapecat.outputs.report.tracks import Detected, Timeline, read_timelines
 from shapecat.outputs.report.writing import RunReport, _faces, read_report
 from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.labels.meaning import TrackLabel
@@ -422,19 +422,26 @@ def test_strip_frames_show_new_tracks_first() -> None:
     assert strip == {("/d", k): pytest.approx(0.5 * k) for k in frames}
 
 
-@pytest.mark.parametrize("flag", ["touches_border", "occluded"])
-def test_whole_views_are_preferred_to_larger_cut_ones(run: Path, flag: str) -> None:
-    """The crop of a card should show the whole object."""
+@pytest.mark.parametrize("flag", ["touches_border", "occluded", "image border"])
+def test_whole_views_are_preferred_to_larger_cut_ones(
+    run: Path, flag: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The crop of a card should show the whole object, also if the colour image cuts it."""
     table = pq.read_table(run / "detections.parquet")
-    (run / "masks.parquet").unlink(missing_ok=True)
+    areas = dict[Detected, tuple[float, bool]]()
+    monkeypatch.setattr(choosing, "_areas", lambda _: areas)
     timelines = read_timelines(run)
     track, line = max(timelines.items(), key=lambda item: len(item[1].keys))
     owned = {key: k for k, key in enumerate(line.keys)}
     rows = table.to_pylist()
     for row in rows:
-        cut = owned.get((row["topic"], row["frame"], row["detection"]), 1) % 2 == 0
+        key = (row["topic"], row["frame"], row["detection"])
+        cut = owned.get(key, 1) % 2 == 0
         row |= {"points": 3000 if cut else 1000, "touches_border": False, "occluded": False}
-        row[flag] = cut
+        if flag in row:
+            row[flag] = cut
+        else:
+            areas[key] = (row["points"], cut)
     pq.write_table(pa.Table.from_pylist(rows, table.schema), run / "detections.parquet")
     chosen = choose_frames(run, timelines).candidates
     views = [k for (topic, frame, _), k in owned.items() if track in chosen.get((topic, frame), ())]

@@ -326,20 +326,32 @@ def test_texts_are_those_of_run_and_last_event(shown: dict[str, Any]) -> None:
     check_entity(shown["/log"], "TextLog", text=["#2 can 0.61 appears"], level=["INFO"])
 
 
-def test_cloud_of_level_lidar_without_fixed_frame(tmp_path: Path) -> None:
-    """Its z axis is up; its scene is in its own frame, whose pose in another is not shown."""
+@pytest.mark.parametrize(
+    ("up", "axes"),
+    [
+        ((0.0, 0.0, 1.0), [3, 5, 1]),
+        ((0.4, -0.3, 0.87), [3, 5, 1]),
+        ((0.2, -0.95, -0.25), [3, 2, 5]),
+    ],
+)
+def test_cloud_without_fixed_frame(tmp_path: Path, up: Any, axes: list[int]) -> None:
+    """The z axis of a laser scanner is up, and y of a camera is down, also for its loose points.
+
+    The scene is in the frame of the sensor, whose pose in another is not shown.
+    """
     first, _ = items()
     first = replace(first, indices=np.array([1, 2]))
     points = np.array([[4.1, 1.2, -0.5], [2.3, -3.4, 0.25], [2.6, -3.7, 0.3]], np.float32)
     frame = Frame("/lidar", 0, stamp(0), stamp(0), "lidar", points=points)
     pose = Pose(TURNS[0].as_matrix(), PLACES[0])
+    floor = Plane(np.array(up), -0.5, np.eye(3), 0.7, 0.0)  # it confirms the up direction
     labelled = LabelledFrame(
-        "/lidar", 0, stamp(0), stamp(0), "lidar", pose, (), (first,), (), {},
-        np.array([0.0, 0.0, 1.0]),
+        "/lidar", 0, stamp(0), stamp(0), "lidar", pose, (floor,), (first,), (), {},
+        np.array(up),
     )  # fmt: skip
     shown = contents(write_frames(tmp_path / "review.rrd", [ReviewFrame(labelled, frame)]))
 
-    check_entity(shown["/world//lidar"], "ViewCoordinates", xyz=[[3, 5, 1]])
+    check_entity(shown["/world//lidar"], "ViewCoordinates", xyz=[axes])
     check(shown["/world//lidar/scene"]["Points3D:positions"], points[:1], "scene")
     check(shown["/world//lidar/objects/points"]["Points3D:positions"], points[1:], "points")
     assert not shown.keys() & {"/world", "/world//lidar/camera", "/world/seen//lidar"}

@@ -388,6 +388,20 @@ def test_true_boxes_contain_points_of_their_object(recording: Path) -> None:
         np.testing.assert_allclose(center, entry["center"], atol=1e-4)
 
 
+def test_true_planes_contain_their_points(recording: Path) -> None:
+    truth = json.loads(recording.with_name("demo.truth.json").read_text("utf-8"))[1]
+    world = make_scene("tabletop", np.random.default_rng(11), frames=3)
+    frame, labels = render_frame(world, 1, rng=np.random.default_rng(0), sensor=IDEAL)
+
+    assert truth["planes"]
+    for plane in truth["planes"]:
+        own = frame.xyz()[labels.reshape(-1) == plane["label"]]
+        offsets = own @ plane["normal"] - plane["offset"]
+        assert np.mean(np.abs(offsets) < 2e-3) > 0.9  # the others are on sides of the table
+        place = transform(world.path[1], np.array(plane["normal"]) * plane["offset"])
+        assert place[2] == pytest.approx(plane["height"], abs=1e-4)
+
+
 def digest(path: Path) -> str:
     total = hashlib.sha256()
     with path.open("rb") as stream:

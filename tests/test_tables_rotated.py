@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from shapecat.completion import DIRECTIONS
 from shapecat.config import TrackingSettings
+from shapecat.geometry import box_corners
 from shapecat.outputs.report.tracks import read_timelines
 from shapecat.runs.labelled_frames import _join, read_labelled_frames
 from shapecat.runs.labelled_tracks import LabelledTracks, read_annotation_frames
@@ -563,6 +564,18 @@ def test_parts_of_merged_track_become_one_object(run: Path) -> None:
     for some in ([hidden, cut], [cut, hidden]):  # a part that is not whole makes the object so
         joined = _join(some, up.tolist())
         assert (joined.occluded, joined.touches_border) == (True, True)
+    assert not np.allclose(high.posterior, low.posterior)
+    assert_allclose(whole.posterior, (high.posterior + low.posterior) / 2)
+    assert not np.allclose(high.causal, low.causal)
+    assert_allclose(whole.causal, (high.causal + low.causal) / 2)
+    vague = replace(parts[0], full=None)  # only its visible part is known
+    for some in ([vague, parts[1]], [parts[1], vague]):
+        box = _join(some, up.tolist()).full
+        assert box is not None
+        corners = np.concatenate([box_corners(part.full or part.box) for part in some])
+        local = (corners - box.center) @ Rotation.from_quat(box.orientation).as_matrix()
+        assert_allclose(np.abs(local).max(axis=0), box.size / 2, atol=1e-5)
+    assert _join([vague, replace(parts[1], full=None)], up.tolist()).full is None
     assert whole.detections == (*high.detections, *low.detections)
     assert len(set(whole.detections)) == 2
 
