@@ -13,7 +13,7 @@ from shapecat.config import Settings
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.evaluation import View, evaluate
 from shapecat.evaluation.training import fit_views
-from shapecat.evaluation.views import describe_views
+from shapecat.evaluation.views import DescribedViews, describe_views
 from shapecat.learning import Categorizer, load_model, save_model
 from shapecat.models import arrangements
 from shapecat.models.arrangements import (
@@ -25,7 +25,13 @@ from shapecat.models.arrangements import (
 )
 from shapecat.models.card import write_card
 from shapecat.models.fragments import cut_fragment, remove_base
-from shapecat.models.sets import SimulatedViews, collect, options_of, partial_views
+from shapecat.models.sets import (
+    SimulatedViews,
+    clear_views,
+    collect,
+    options_of,
+    partial_views,
+)
 from shapecat.models.simulated_views import (
     describe_arrangement,
     simulate_arrangement,
@@ -175,6 +181,32 @@ def test_training_uses_only_given_kinds_of_distractors(
 
     assert {item.label for item in objects} == {"unknown"}
     assert set(made) == {"pan", "hammer"}
+
+
+@pytest.mark.parametrize(
+    ("change", "partial", "clear"),
+    [
+        ({}, False, True),
+        ({"resting_pose": "upside_down"}, False, False),
+        ({"source": "fragment"}, True, False),
+        ({"source": "background"}, True, False),
+        ({"visible": 0.69}, True, False),
+        ({"overlap": 0.74}, True, False),
+    ],
+)
+def test_clear_views_are_whole_and_well_segmented(
+    change: dict[str, Any], partial: bool, clear: bool
+) -> None:
+    """The figures of the card, and the rejection of parts, are those of these views."""
+    about = {"resting_pose": "lying", "source": "detected", "visible": 0.71, "overlap": 0.76}
+    described = DescribedViews(
+        np.zeros((1, 2), np.float32), np.array(["cup"]), np.array(["a"]), np.array([90]), np.ones(1)
+    )
+    columns = {name: np.array([value]) for name, value in {**about, **change}.items()}
+    views = SimulatedViews(described, **columns, sensor=np.array(["kinect"]))
+
+    assert partial_views(views).tolist() == [partial]
+    assert clear_views(views).tolist() == [clear]
 
 
 def test_test_set_shares_no_distractors_with_the_other_sets() -> None:

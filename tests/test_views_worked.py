@@ -90,6 +90,38 @@ def test_descriptor_has_true_heights_elevation_and_distance() -> None:
     assert value["metric.height"] == pytest.approx(0.26 - low, abs=0.012)
 
 
+def cuboid(size: F8) -> F8:
+    """Return the points of the top and of the side at +x of a cuboid on its support."""
+    a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-0.5, 0.5, 41)] * 2))
+    top = np.stack([a, b, np.ones(a.size)], axis=1)
+    side = np.stack([np.full(a.size, 0.5), a, b + 0.5], axis=1)
+    return np.concatenate([top, side]) * size
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+def test_descriptor_has_true_widths_along_and_across_the_view(yaw: float) -> None:
+    """Widths of round objects are all equal, so a box shows which is which.
+
+    They do not change if object and sensor are turned together.
+    """
+    turn = Rotation.from_euler("z", yaw)
+    depth, width, height = 0.06, 0.14, 0.1
+    eye = turn.apply([0.9, 0.0, 0.5])
+    value = described(turn.apply(cuboid(np.array([depth, width, height]))), eye)
+    wide = np.hypot(depth, width)  # along the diagonal, which is near one of 16 directions
+
+    for name, length in {"along": depth, "across": width, "wide": wide, "height": height}.items():
+        assert value[f"metric.{name}"] == pytest.approx(length, abs=0.003)
+    ratios = {
+        "height_to_across": (height, width),
+        "along_to_across": (depth, width),
+        "height_to_widest": (height, wide),
+        "narrow_to_wide": (depth, wide),
+    }
+    for name, (a, b) in ratios.items():
+        assert value[f"context.{name}"] == pytest.approx(a / (a + b), abs=0.01)
+
+
 def walls() -> F8:
     """Return two walls 5 cm apart on a floor, like a mug cut open."""
     a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0, 0.08, 33)] * 2))
@@ -97,6 +129,21 @@ def walls() -> F8:
     floor = np.stack([a * 0.05 / 0.08, b, zero], axis=1)
     left, right = np.stack([zero, b, a], axis=1), np.stack([zero + 0.05, b, a], axis=1)
     return np.concatenate([left, floor, right])
+
+
+def test_level_surface_counts_where_it_is() -> None:
+    """The top of a box, the bottom of an open mug, and a step half as high as its box."""
+    size, eye = np.array([0.06, 0.14, 0.1]), np.array([0.9, 0.0, 0.5])
+    block, step = cuboid(size), cuboid(size * [1, 1, 0.5]) + size * [1, 0, 0]
+    above = np.array([0.025, 0.04, 0.9])
+    views = (block, eye), (walls(), above), (np.concatenate([block, step]), eye)
+    found = [
+        [value["context.share_up_top"], value["context.share_up_bottom"]]
+        for value in (described(*view) for view in views)
+    ]
+
+    assert_allclose(found, [[0.45, 0], [0, 0.25], [0.23, 0]], atol=0.1)
+    assert found[0][1] == found[1][0] == found[2][1] == 0
 
 
 def test_surface_edges_do_not_cross_gaps() -> None:
