@@ -1,5 +1,6 @@
 """Shared fixtures: the installed command, real data if present, a simulated recording."""
 
+import gc
 import hashlib
 import os
 import shutil
@@ -24,7 +25,8 @@ from tests.browser import Browser
 
 LONGEST = (
     *("test_report_serve", "test_remote", "test_stopping", "test_report", "test_batch", "test_api"),
-    *("test_odd", "test_command_line", "test_learning_default_model", "test_exports_images"),
+    *("test_odd", "test_command_line", "test_tracking", "test_exports_images"),
+    *("test_learning_default_model", "test_reuse"),
     *("test_labelling_loop", "test_crash", "test_second_look", "test_packaging", "test_executors"),
     *("test_simulation_worlds", "test_simulation_physics", "test_architecture", "test_docs_run"),
     *("test_detection_stacks", "test_detection", "test_review", "test_pipeline"),
@@ -50,6 +52,11 @@ def pytest_configure() -> None:
     collect_seldom()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.setdefault(FSYNC, "0")
+
+
+def pytest_unconfigure() -> None:
+    """Exclude all objects from the collections at the end, which take seconds otherwise."""
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
