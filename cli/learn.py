@@ -6,19 +6,19 @@ import click
 
 from shapecat.outputs.counts import plural
 
-from .options import ANY_PATH, json_option, seed_option
+from .options import ANY_PATH, json_option, none_if_default, seed_option
 from .render import note_skipped, print_json, progress_bars
 
 
 @click.command()
-@click.argument("model", type=ANY_PATH)
+@click.argument("model", type=ANY_PATH, callback=none_if_default)
 @click.argument("dataset", type=ANY_PATH)
 @click.option("--out", type=ANY_PATH, required=True, help="Model file to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing model.")
 @seed_option
 @json_option
 def learn(
-    *, model: Path, dataset: Path, out: Path, overwrite: bool, seed: int, as_json: bool
+    *, model: Path | None, dataset: Path, out: Path, overwrite: bool, seed: int, as_json: bool
 ) -> None:
     """Add the new categories of a data set to a model.
 
@@ -33,10 +33,9 @@ def learn(
     from shapecat.evaluation.training import learn_on_folder
     from shapecat.learning import require_model_path
 
-    source = None if str(model) == "default" else model
     require_model_path(out, overwrite=overwrite)
     with progress_bars() as bars:
-        result = learn_on_folder(source, dataset, out, seed=seed, observe=bars)
+        result = learn_on_folder(model, dataset, out, seed=seed, observe=bars)
     note_skipped(result)
     if as_json:
         print_json(result)

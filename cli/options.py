@@ -72,10 +72,17 @@ set_option = click.option(
     metavar="NAME=VALUE",
     help="Change a setting, for example detection.max_range_m=1.5. Repeatable.",
 )
+
+
+def none_if_default(_ctx: click.Context, _param: click.Parameter, path: Path | None) -> Path | None:
+    """Return None, which means shapecat's own model, for the name ``default``."""
+    return None if path == Path("default") else path
+
+
 model_option = click.option(
     "--model",
     type=ANY_PATH,
-    callback=lambda _ctx, _param, path: None if path == Path("default") else path,
+    callback=none_if_default,
     help="Model file; by default `default`, the model that comes with shapecat.",
 )
 

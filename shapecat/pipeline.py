@@ -32,15 +32,15 @@ from shapecat.runs.jobs import (
     Job,
     Summary,
     add_warnings,
+    describe_differences,
     describe_run,
     differences,
-    follow,
     identify,
-    other_work,
     require_model,
     require_other_folder,
     require_unchanged,
     summarize,
+    update_place,
 )
 from shapecat.runs.labels.corrections import adopt_labels, read_labels
 from shapecat.runs.labels.replaced import forget_old_labels, keep_labels, require_labels
@@ -191,13 +191,13 @@ def _add_outputs(
     if not same_content(run["input"], job.source, content.result):
         differing["input"] = f"{run['input']['path']} in the old run"
     if differing:
-        other = other_work(differing)
+        other = describe_differences(differing)
         msg = f"{job.folder}: has results of {other}; choose another --out, or --overwrite it"
         raise OutputError(msg)
     if not job.target:
         with writing_outputs(job.folder):
             sweep(job.folder)
-            if follow(run, planned["input"]):
+            if update_place(run, planned["input"]):
                 write_run(job.folder, run)
             annotate(job.folder, recording, run, observe)
     return summarize(run, processed=False)

@@ -28,15 +28,15 @@ __all__ = [
     "Job",
     "Summary",
     "add_warnings",
+    "describe_differences",
     "describe_run",
     "differences",
-    "follow",
     "identify",
-    "other_work",
     "require_model",
     "require_other_folder",
     "require_unchanged",
     "summarize",
+    "update_place",
 ]
 
 _LIBRARIES = ("numpy", "numba", "mcap", "rosbags", "rerun-sdk", "pyarrow")
@@ -181,7 +181,7 @@ def differences(run: RunInfo, planned: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def other_work(differing: Mapping[str, str]) -> str:
+def describe_differences(differing: Mapping[str, str]) -> str:
     """Return, for a message, how a run differs: its `differences`, and any in the input."""
     listed = "; ".join(f"{name}: {text}" for name, text in differing.items())
     return f"another input, model or settings ({listed})"
@@ -219,7 +219,7 @@ def identify(run: RunInfo, content: ContentDigest) -> None:
     run["work"] = work_id(run)
 
 
-def follow(run: RunInfo, found: InputInfo) -> bool:
+def update_place(run: RunInfo, found: InputInfo) -> bool:
     """If a run's recording is gone from its path, store where it was ``found``, return True."""
     moved = not Path(run["input"]["path"]).exists() and run["input"]["path"] != found["path"]
     if moved:

@@ -12,8 +12,7 @@ from pathlib import Path
 from urllib.parse import quote, unquote
 
 from shapecat.arrays import F8
-from shapecat.errors import OutputError, explained
-from shapecat.errors import listed as named
+from shapecat.errors import OutputError, explained, listed
 from shapecat.outputs.counts import plural
 from shapecat.outputs.report.cards import Card, is_unsure
 from shapecat.outputs.report.choosing import choose_frames
@@ -147,10 +146,10 @@ class Reports:
                 cards.append(report.listed(self.link(report)))
         count = Counter(card.name for card in cards)
         names = (str(Path(unquote(c.link)).parent) if count[c.name] > 1 else c.name for c in cards)
-        listed = [replace(card, name=name) for card, name in zip(cards, names, strict=True)]
+        entries = [replace(card, name=name) for card, name in zip(cards, names, strict=True)]
         failed = _failed_recordings(self.above / _MANIFEST) - {r.folder.name for r in self.runs}
-        note = f"{plural(len(failed), 'recording')} failed: {named(sorted(failed))} ({_MANIFEST})"
-        return index_page(self.above.resolve().name, listed, [note] if failed else [])
+        note = f"{plural(len(failed), 'recording')} failed: {listed(sorted(failed))} ({_MANIFEST})"
+        return index_page(self.above.resolve().name, entries, [note] if failed else [])
 
     def write(self) -> list[Path]:
         """Write all pages, the index last, and return their paths.

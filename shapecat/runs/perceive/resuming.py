@@ -9,7 +9,7 @@ from pathlib import Path
 from shapecat.errors import OutputError
 from shapecat.runs.folder import OUTPUT_OPTIONS, clear, read_run, write_run
 from shapecat.runs.identity import same_content, unchanged
-from shapecat.runs.jobs import Job, differences, other_work
+from shapecat.runs.jobs import Job, describe_differences, differences
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables.reading import count_rows
 from shapecat.runs.tables.schemas import PERCEIVED, TABLES
@@ -42,14 +42,14 @@ def require_resumable(job: Job, planned: RunInfo, digest: Callable[[], str]) -> 
         run = _with_outputs(read_run(folder), planned)
     except OutputError:  # nothing can continue it
         return
-    differing, place = _perceived_otherwise(run, planned), run["input"]["path"]
+    differing, place = _perception_differences(run, planned), run["input"]["path"]
     if place != planned["input"]["path"] and not same_content(run["input"], job.source, digest):
         differing["input"] = f"{place} in the old run"
     if not differing:
         return
     msg = (
-        f"{folder}: has finished work of an interrupted run of {other_work(differing)}; repeat its "
-        "command to continue it, choose another --out, or --overwrite it"
+        f"{folder}: has finished work of an interrupted run of {describe_differences(differing)}; "
+        "repeat its command to continue it, choose another --out, or --overwrite it"
     )
     raise OutputError(msg)
 
@@ -72,12 +72,12 @@ def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], st
     """
     with suppress(OutputError):
         run = _with_outputs(read_run(folder), planned)
-        if not _perceived_otherwise(run, planned) and _same_recording_and_versions(
+        if not _perception_differences(run, planned) and _same_recording_and_versions(
             run, planned, source, digest
         ):
             _require_complete(folder)
             if differences(run, planned):
-                run = _with_frames(planned, run)
+                run = _with_perceived(planned, run)
                 write_run(folder, run)
             elif "perceive" in run["seconds"]:
                 run["counts"]["resumed"] = run["counts"]["frames"]
@@ -110,7 +110,7 @@ def take_over_frames(
     """
     try:
         run = _with_outputs(read_run(finished), planned)
-        later = bool(differences(run, planned)) and not _perceived_otherwise(run, planned)
+        later = bool(differences(run, planned)) and not _perception_differences(run, planned)
         alike = later and _same_recording_and_versions(run, planned, source, digest)
         if not (alike and _is_complete(finished, run)):
             return planned
@@ -118,7 +118,7 @@ def take_over_frames(
         return planned
     for table in PERCEIVED:
         _link(finished / f"{table}.parquet", folder)
-    new = _with_frames(planned, run)
+    new = _with_perceived(planned, run)
     write_run(folder, new)
     return new
 
@@ -130,13 +130,13 @@ def has_work(folder: Path) -> bool:
     return False
 
 
-def _perceived_otherwise(run: RunInfo, planned: RunInfo) -> dict[str, str]:
+def _perception_differences(run: RunInfo, planned: RunInfo) -> dict[str, str]:
     """Return the `differences` of two runs that affect the perceived frames."""
     found = differences(run, planned).items()
     return {name: text for name, text in found if not name.startswith(_LATER)}
 
 
-def _with_frames(planned: RunInfo, run: RunInfo) -> RunInfo:
+def _with_perceived(planned: RunInfo, run: RunInfo) -> RunInfo:
     """Return ``planned`` with the results of perceiving from another run."""
     new, counts, seconds = planned.copy(), run["counts"].copy(), run["seconds"]
     counts.pop("tracks", None)
