@@ -49,7 +49,7 @@ class ColourImage(Record):
     data: bytes | memoryview
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the content to pickle, with a copy of the data: a view cannot be pickled."""
+        """Return the content to pickle, with a copy of the data: pickle refuses a memoryview."""
         return vars(self) | {"data": bytes(self.data)}
 
 

@@ -18,7 +18,7 @@ LENS_MODELS = ("plumb_bob", "rational_polynomial", *FISHEYE_MODELS)
 """The supported lens models of OpenCV's calibration."""
 
 _ROUNDS = 30
-"""Maximum number of iterations; it is needed near the edge of lenses of 120 degrees."""
+"""Maximum number of iterations; lenses of 120 degrees need as many near their edge."""
 _ENOUGH_PX = 1e-4
 """Error at which the iterations end."""
 _WRONG_PX = 0.1
@@ -28,7 +28,7 @@ _LEAST_SHARE = 0.3
 
 
 def distort(rays: F8, model: str, coefficients: Sequence[float]) -> F8:
-    """Return the slopes (..., 2) after distortion of rays with slopes (..., 2).
+    """Distort rays, which are given and returned as slopes (..., 2).
 
     Source: the lens models of OpenCV's calibration (Brown 1966; Kannala & Brandt 2006).
 

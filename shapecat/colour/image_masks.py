@@ -14,7 +14,7 @@ __all__ = ["box_of", "find_masks", "mask_of"]
 def find_masks(frame: Frame, view: ColourView, objects: Sequence[U4]) -> ImageMasks:
     """Return the masks of a frame's detections on a colour image.
 
-    They follow from the depth image and the cameras alone, not from the colours. An
+    The masks follow from the depth image and the cameras alone, not from the colours. An
     unorganized cloud has no masks.
 
     Parameters

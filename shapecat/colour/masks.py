@@ -15,9 +15,9 @@ __all__ = ["EMPTY_MASK", "Mask", "dense_masks", "union"]
 _NARROW_PX = 4.0
 """Widest gap in an object that is filled, in pixels of the depth image."""
 _WIDE_PX = 24.0
-"""Largest distance, in pixels of the depth image, of an object that unknown pixels may join."""
+"""Largest distance from an unknown pixel to the object it joins, in pixels of the depth image."""
 _RAGGED_PX = 5.0
-"""Width, in pixels of the depth image, of the window that smooths the ragged outlines of depth."""
+"""Width, in pixels of the depth image, of the window that smooths the ragged outlines of masks."""
 
 
 class Mask(Record):
@@ -72,7 +72,7 @@ def dense_masks(
     objects : for each object, (k,) uint32 flat indices of its pixels in the frame.
     lens : the colour camera; not needed for a registered image.
     colour_from_depth : pose of the depth sensor in the optical frame of the colour camera; None for
-        a registered image, whose pixels coincide with the depth image's.
+        a registered image, whose pixels coincide with those of the depth image.
 
     Returns
     -------
@@ -268,6 +268,6 @@ def _majority(labels: I4, label: int, radius: int, pixels: Bool) -> tuple[int, i
 
 @kernel(inner=True)
 def _count(row: I4, label: int, one: int, counts: I4) -> None:
-    """Add ``one`` to the counts of the pixels that have a label."""
+    """Add ``one``, which is 1 or -1, to the count of each column whose pixel has the label."""
     for u in range(row.size):
         counts[u] += one if row[u] == label else 0

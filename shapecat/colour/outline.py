@@ -11,7 +11,7 @@ from shapecat.jit import kernel
 __all__ = ["joined", "outlines"]
 
 _TOLERANCE_PX = 0.75
-"""Corners that stick out less are dropped; the steps of a slanted edge stick out by 0.71."""
+"""Corners that stick out by fewer pixels are dropped; steps of a slanted edge do so by 0.71."""
 
 
 def outlines(mask: Mask) -> list[F8]:
@@ -41,7 +41,7 @@ def outlines(mask: Mask) -> list[F8]:
 
 
 def joined(rings: Sequence[F8]) -> F8:
-    """Join outlines (n, 2) into one polygon (m, 2), for formats that store one per object.
+    """Join outlines (n, 2) into one polygon (m, 2), for formats with one polygon per object.
 
     A double edge links the nearest corners, as in converters of COCO data sets.
     """
@@ -55,13 +55,13 @@ def joined(rings: Sequence[F8]) -> F8:
 
 
 def _area(ring: I4) -> float:
-    """Return the area inside corners (n, 2) in clockwise order on the image; holes are negative."""
+    """Return the area inside a clockwise ring of corners (n, 2); the area of a hole is negative."""
     x, y = ring.T
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2
 
 
 def _simplified(ring: F8) -> F8:
-    """Drop corners of a closed line (Douglas and Peucker 1973)."""
+    """Drop the corners (n, 2) of a closed line that hardly stick out (Douglas and Peucker 1973)."""
     farthest = int(((ring - ring[0]) ** 2).sum(axis=1).argmax())
     closed = np.concatenate([ring, ring[:1]])
     keep = np.zeros(len(closed), np.bool_)
@@ -74,7 +74,7 @@ def _simplified(ring: F8) -> F8:
 
 @kernel
 def _keep_far(line: F8, first: int, last: int, keep: Bool) -> None:
-    """Mark corners between two others that are far from the simplified line."""
+    """Mark in ``keep`` the corners from ``first`` to ``last`` that the simplified line keeps."""
     stack = [(first, last)]
     while len(stack) > 0:
         a, b = stack.pop()
@@ -94,10 +94,11 @@ def _keep_far(line: F8, first: int, last: int, keep: Bool) -> None:
 
 @kernel
 def _trace(inside: Bool, corners: I4, ends: I4) -> int:
-    """Trace the borders of regions, the inside on the right; return the number of borders.
+    """Trace the borders of regions, with the inside on the right; return the number of borders.
 
-    ``inside`` (h, w) is False along its edge. ``corners`` gets column and row of the corners of
-    all borders, ``ends`` where each border ends. A border starts on top of a pixel, eastward.
+    ``inside`` (h, w) is False along its edge. ``corners`` gets the column and row of the corners of
+    all borders, ``ends`` the number of corners up to the end of each border. A border starts along
+    the top of a pixel, to the right.
     """
     walked = np.zeros(inside.shape, np.bool_)
     count = length = 0

@@ -118,7 +118,7 @@ def _monotonic_up_to(lens: LensCamera) -> float:
 
 @kernel
 def _to_camera(points: F4, rotation: F4, shift: F4, transformed: F4) -> None:
-    """Write points (n, 3) in the frame of a camera, (3, n); z is -1 where they are not finite."""
+    """Transform points (n, 3) to the frame of a camera, (3, n); z is -1 if they are not finite."""
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         finite = np.isfinite(x + y + z)

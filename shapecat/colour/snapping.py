@@ -18,13 +18,13 @@ from shapecat.jit import kernel
 __all__ = ["snapped"]
 
 _BAND_PX = 3.0
-"""Largest distance an outline moves. Like the next three, in pixels of the depth image."""
+"""Largest distance an outline moves; this and the next three are in pixels of the depth image."""
 _CORE_PX = 1.5
 """Pixels farther than this from the outline are samples of the colours on their side."""
 _WINDOW_PX = 6.0
 """Half the width of the window from which samples are taken."""
 _ERROR_PX = 3.0
-"""A pixel this far from the outline changes sides if the other side is e times as likely."""
+"""A pixel this far from the outline changes sides if the other side is over e times as likely."""
 _FEWEST = 4
 """Minimum number of samples of each side; with fewer, the colour of a pixel has no influence."""
 _NOISE = 64.0
@@ -78,7 +78,7 @@ class _Match(NamedTuple):
 
 
 def _match(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> _Match:
-    """Return the pixels that match a mask; ``owners`` (h, w) are the numbers of the masks."""
+    """Return the pixels that match a mask; ``owners`` (h, w) is the number of each pixel's mask."""
     band_px, radius = max(2.0, _BAND_PX * scale), max(3, round(_WINDOW_PX * scale))
     margin, (left, top, width, height) = int(band_px) + radius, mask.box
     rows = slice(max(0, top - margin), top + height + margin)
@@ -119,8 +119,9 @@ def _compare(colours: U1, depth: F4, band: float, core: float, window: int, log_
     """Write to ``log_ratio`` the log-likelihood ratio of inside to outside, for pixels in the band.
 
     The colours of each side are modelled by a normal distribution with the same variance in all
-    channels, fitted to a grid of pixels around it. ``depth`` (h, w) is the distance from the
-    outline in pixels, positive inside.
+    channels, fitted to a grid of pixels around the pixel. ``depth`` (h, w) is the distance from the
+    outline in pixels, positive inside. ``band``, ``core`` and ``window`` are as `_BAND_PX`,
+    `_CORE_PX` and `_WINDOW_PX`, in pixels of the colour image.
     """
     height, width, channels = colours.shape
     step = max(1, window // 4)
@@ -158,7 +159,10 @@ def _compare(colours: U1, depth: F4, band: float, core: float, window: int, log_
 
 @kernel(inner=True)
 def _negative_log_likelihood(colour: U1, total: F4, squares: float, count: int) -> float:
-    """Return the negative log-likelihood of a colour, up to a constant."""
+    """Return the negative log-likelihood of a colour (channels,), up to a constant.
+
+    ``total`` (channels,) is the sum of ``count`` sampled colours, ``squares`` that of all squares.
+    """
     apart, of_means = 0.0, 0.0
     for k in range(colour.size):
         mean = total[k] / count

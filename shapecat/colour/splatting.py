@@ -1,4 +1,4 @@
-"""A depth image as a colour camera sees it: its pixels splatted, the nearest on top."""
+"""Splat the pixels of a depth image onto the image of a colour camera, the nearest on top."""
 
 from collections.abc import Sequence
 
@@ -13,9 +13,9 @@ from shapecat.types import Camera, Pose
 __all__ = ["splat_depth"]
 
 _FOOTPRINT_PX = 0.05
-"""Margin on each side of a splatted depth pixel, in colour pixels, to leave no gaps."""
+"""Margin on each side of a splatted depth pixel, in colour pixels; it prevents gaps."""
 _HIDDEN = 0.02
-"""An object is hidden where something else is nearer by more than this fraction of its distance."""
+"""A surface hides an object if it is nearer by more than this fraction of the object's depth."""
 _SPARSE = 4
 """Outside objects, only every fourth row and column of the depth image is used."""
 _BESIDE_PX = 30
@@ -29,7 +29,7 @@ def splat_depth(
 
     Each depth pixel of an object covers a square of its own size on the colour image, slightly
     enlarged; where squares overlap, the nearest one shows. The other depth pixels are splatted
-    coarsely: they only hide objects, or show that a gap belongs to none.
+    coarsely: they only hide objects, or show that a gap belongs to no object.
 
     Parameters
     ----------
@@ -41,11 +41,12 @@ def splat_depth(
 
     Returns
     -------
-    left, top : column and row, in the image, of the first pixel of the part with the objects.
+    left, top : column and row, in the image, of the first pixel of ``labels``, which is the part of
+        the image around the objects.
     labels : (h, w) int32 the object, from 1; 0 for another surface, -1 where nothing is known.
         Label 0 occurs only within ``boxes``.
-    boxes : (n + 1, 4) bounding box of each label's pixels, including hidden ones:
-        left, top, right + 1, bottom + 1, in pixels of the part; zeros for a label without pixels.
+    boxes : (n + 1, 4) bounding box of each label's pixels, including hidden ones: left, top,
+        right + 1, bottom + 1, in pixels of ``labels``; zeros for a label without pixels.
 
     Notes
     -----
@@ -63,9 +64,10 @@ def splat_depth(
 
 
 def _rays(camera: Camera, colour_from_depth: Pose) -> tuple[F4, F4, F4]:
-    """Return the parts of the rays by column (3, w) and by row (3, h), and the translation (3,).
+    """Return the rays of depth pixels in the colour camera's frame, in two parts, and its offset.
 
-    The ray of a pixel in the colour camera's frame is the sum of its column's and its row's part.
+    The ray of pixel (u, v) is column u of the first array (3, w) plus column v of the second one
+    (3, h). The third array (3,) is the translation of ``colour_from_depth``, metres.
     """
     x = (np.arange(camera.width) - camera.cx) / camera.fx
     y = (np.arange(camera.height) - camera.cy) / camera.fy
@@ -91,9 +93,9 @@ def _splat(
 ) -> tuple[int, int, I4]:
     """Return left, top and labels as `splat_depth` does, and write its ``boxes``.
 
-    ``pixels`` and ``labels`` (n,) are flat depth pixels and their objects; ``rays`` are from
-    `_rays`; ``scale`` is the colour pixels per depth pixel at equal distance; ``size`` is width and
-    height of the colour image.
+    ``pixels`` (n,) are flat indices into ``depth``, ``labels`` (n,) their objects, from 1. ``rays``
+    is from `_rays`. ``scale`` is the width of a depth pixel in colour pixels at equal distance.
+    ``size`` is width and height of the colour image.
     """
     beside = _list_beside(depth, pixels)
     projections = _project_pixels(depth, pixels, rays, lens)
@@ -116,7 +118,10 @@ def _splat(
 
 @kernel(inner=True)
 def _list_beside(depth: F4, pixels: U4) -> U4:
-    """Return the background pixels with depth in every `_SPARSE`-th row and column."""
+    """Return, in every `_SPARSE`-th row and column, the pixels with depth that are not listed.
+
+    ``pixels`` lists flat indices into ``depth``, and so does the result.
+    """
     rows, columns = (depth.shape[0] - 1) // _SPARSE + 1, (depth.shape[1] - 1) // _SPARSE + 1
     outside = np.ones((rows, columns), np.bool_)
     v, width = 0, depth.shape[1]
@@ -168,11 +173,11 @@ def _project_pixels(depth: F4, pixels: U4, rays: tuple[F4, F4, F4], lens: Lens) 
 
 @kernel(inner=True)
 def _cover(projections: F4, labels: I4, half: float, size: tuple[int, int], boxes: I4) -> I4:
-    """Return the square of image pixels whose centres each depth pixel covers.
+    """Return, for each depth pixel, the square of image pixels whose centres it covers.
 
     Squares are (n, 4) left, top, right + 1, bottom + 1; zeros outside the image. ``boxes`` is set
-    to the box around the squares of each label. ``projections`` is from `_project_pixels`;
-    ``half`` is half the colour pixels per depth pixel at equal distance.
+    to the box around the squares of each label. ``projections`` is from `_project_pixels`; ``half``
+    is half the width of a depth pixel in colour pixels at equal distance.
     """
     nought, one = np.float32(0), np.float32(1)
     width, height = np.float32(size[0]), np.float32(size[1])
@@ -194,7 +199,10 @@ def _cover(projections: F4, labels: I4, half: float, size: tuple[int, int], boxe
 
 @kernel(inner=True)
 def _window(boxes: I4, margin: int, size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Return the window around boxes, and shift the boxes into it; empty boxes become zeros."""
+    """Return left, top, right + 1, bottom + 1 of a window that encloses boxes with a margin.
+
+    The boxes are shifted into the window in place; empty boxes become zeros.
+    """
     left, top, right, bottom = size[0], size[1], 0, 0
     for box in boxes:
         if box[2] > 0:
@@ -220,9 +228,10 @@ def _paint(
     nearest: F4,
     splat: I4,
 ) -> None:
-    """Paint the labels of squares into the window at ``corner``, where they are the nearest.
+    """Paint the labels of squares into a window, where they are the nearest.
 
-    ``inverse_depth`` (n,) and ``nearest`` (h, w) are inverse depths.
+    ``inverse_depth`` (n,) is that of the squares, ``nearest`` (h, w) that of the painted labels.
+    ``corner`` is the left and top of the window.
     """
     left, top = corner
     for i in range(labels.size):
@@ -252,7 +261,10 @@ def _nearest_surface(around: F4, corner: tuple[int, int], cell: int, shape: tupl
 
 @kernel(inner=True)
 def _hide(front: F4, cell: int, boxes: I4, nearest: F4, splat: I4) -> None:
-    """Set the label of pixels in boxes to 0 where the front of their cell is nearer."""
+    """Set the labels in boxes to 0 where another surface hides them.
+
+    ``front`` is from `_nearest_surface`; ``nearest`` (h, w) is the inverse depth of the labels.
+    """
     limit, share = np.zeros(splat.shape[1], np.float32), np.float32(1 - _HIDDEN)
     for k in range(boxes.shape[0]):
         left, top, right, bottom = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3]

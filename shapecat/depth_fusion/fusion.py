@@ -101,9 +101,10 @@ def _homography(camera: Camera, earlier_from_sensor: Pose) -> tuple[F4, F4]:
 
 @kernel
 def _expected_depth(depth: F4, range_m: float) -> F4:
-    """Return the expected depth of each pixel: its own; in a hole, a neighbour's, negated.
+    """Return the expected depths (h, w), metres: measured depths, and those of holes, negated.
 
-    It is 0 beyond the range and without a neighbour.
+    The depth of a hole is that of a pixel in the same row or column, at most `REACH` away. It is 0
+    if there is none. Depths beyond the range are 0, too.
     """
     rows, columns = depth.shape
     expected = np.zeros((rows, columns), np.float32)
@@ -164,7 +165,10 @@ def _add_unmoved(expected: F4, earlier: F4, total: F4, count: F4) -> None:
 
 @kernel
 def _add_moved(expected: F4, earlier: F4, homography: F4, shift: F4, total: F4, count: F4) -> None:
-    """Add the earlier depths that agree; a hole that gets one becomes a depth in ``expected``."""
+    """Add the earlier depths that agree to ``total``, and their number to ``count``.
+
+    A hole that gets a depth also gets it in ``expected``.
+    """
     agree, jump = np.float32(AGREE), np.float32(DISCONTINUITY)
     coordinates = np.zeros((3, expected.shape[1]), np.float32)
     x, y, z = coordinates[0], coordinates[1], coordinates[2]
@@ -203,7 +207,10 @@ def _project_row(depths: F4, v: int, homography: F4, shift: F4, x: F4, y: F4, z:
 
 @kernel(inner=True)
 def _interpolate(earlier: F4, x: float, y: float) -> Any:
-    """Interpolate between the four depths around (x, y); 0 if over half the weight is missing."""
+    """Interpolate between the four depths around (x, y); 0 outside the image.
+
+    It is also 0 if more than half of the weight belongs to missing depths.
+    """
     rows, columns = earlier.shape
     zero, one = np.float32(0), np.float32(1)
     if not ((x >= 0) & (y >= 0) & (x < columns - 1) & (y < rows - 1)):
