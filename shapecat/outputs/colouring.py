@@ -17,7 +17,7 @@ from shapecat.types import Frame, LabelledFrame
 __all__ = ["Coloured", "ExportedFrame", "with_colour"]
 
 _AHEAD = 4
-"""Labelled frames that are known in advance."""
+"""Number of labelled frames that are read in advance."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def with_colour(
     OutputError : the recording no longer holds one of the frames.
     """
     awaited = _Awaited(labelled, run)
-    # A clock that was set back gives other images the same stamps, so the nearest may be another.
+    # Images are found by log time: after a clock is set back, several have the same stamp.
     read = read_frames(
         recording,
         run["options"],
@@ -71,7 +71,7 @@ def with_colour(
 
 
 class _Awaited:
-    """The requested frames; a few are known in advance, so that others need not be read."""
+    """The requested frames; a few are read in advance, to know which messages they need."""
 
     def __init__(self, frames: Iterable[LabelledFrame], run: RunInfo) -> None:
         self._topics, self._colours = set(run["options"]["topics"]), {*run["color"].values()}
@@ -88,8 +88,8 @@ class _Awaited:
     def needs(self, topic: str, log_time_ns: int) -> bool:
         """Return whether a depth or colour message belongs, or may belong, to an awaited frame.
 
-        Only the next few awaited frames are known, so a message that is not earlier than the last
-        of these may belong to a later one. Messages of other topics are always needed.
+        Only the next few awaited frames are known. A message that is not earlier than all of these
+        may belong to a frame after them. Messages of other topics are always needed.
         """
         if topic not in self._topics | self._colours:
             return True
@@ -100,7 +100,12 @@ class _Awaited:
         return later or log_time_ns in times
 
     def image_of(self, topic: str, number: int) -> int | None:
-        """Return the log time, ns, of the image of an awaited frame; None if it has none."""
+        """Return the log time, ns, of a frame's colour image; None if there is none.
+
+        Parameters
+        ----------
+        topic, number : the frame's; it is one of the next few awaited frames.
+        """
         named = (one for one in self._next if (one.topic, one.index) == (topic, number))
         masks = next((one.masks for one in named), None)
         return None if masks is None else masks.log_time_ns

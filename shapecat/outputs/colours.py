@@ -15,7 +15,7 @@ CATEGORY_COLOURS: dict[str, tuple[int, int, int]] = {
     "ball": (214, 80, 190),
     "unknown": (226, 226, 220),
 }
-"""Red, green, blue from 0 to 255, legible on light and dark; only unknown is grey."""
+"""Red, green, blue from 0 to 255, legible on light and dark backgrounds; only unknown is grey."""
 
 
 def colour_of(category: str) -> tuple[int, int, int]:
@@ -36,7 +36,7 @@ def colour_of(category: str) -> tuple[int, int, int]:
 
 
 def hex_colour(category: str) -> str:
-    """Return the colour of a category as text.
+    """Return the colour of a category as ``#rrggbb``.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Format counts, the same in every output; loads nothing, as the help of the command needs it."""
+"""Format counts, the same in every output; loads nothing heavy, since ``--help`` uses it."""
 
 from collections.abc import Mapping
 
@@ -18,7 +18,7 @@ def plural(count: int, noun: str) -> str:
 
 
 def by_count(counts: Mapping[str, int]) -> list[tuple[str, int]]:
-    """Return names and counts, largest first, equal ones by name.
+    """Return names and counts, largest count first, and by name where counts are equal.
 
     Examples
     --------
@@ -29,7 +29,7 @@ def by_count(counts: Mapping[str, int]) -> list[tuple[str, int]]:
 
 
 def count_words(counts: Mapping[str, int], none: str = "none") -> str:
-    """Return counts as text, largest first; ``none`` if there are none.
+    """Return counts as text, largest first; without counts, return the text ``none``.
 
     Examples
     --------

@@ -19,11 +19,11 @@ from shapecat.types import Camera, Detection, Frame, LabelledFrame, LabelledObje
 __all__ = ["frame_of", "perceive_alone"]
 
 _FARTHEST_M = 100.0
-"""Values whose median depth, or coordinate, is larger are not in metres."""
+"""Values with a larger median of depths, or of largest coordinates, are not in metres."""
 _FIXED = ([0, 1, 2, 2, 2], [1, 0, 0, 1, 2])
-"""The elements of a camera matrix that are the same for all cameras, without skew."""
+"""Rows and columns of the elements that are 0 or 1 in every camera matrix without skew."""
 _SHORTEST = 0.05
-"""A focal length that is at most this fraction of the image's side is not in pixels."""
+"""A focal length of at most this fraction of the image's width or height is not in pixels."""
 
 
 def frame_of(reading: ArrayLike, intrinsics: ArrayLike | Camera | None = None) -> Frame:
@@ -129,7 +129,7 @@ def perceive_alone(
 def _labelled(
     number: int, detection: Detection, scene: Scene, categories: Sequence[str]
 ) -> LabelledObject:
-    """Return a detection as an object with this number, whose label comes from this view."""
+    """Return a detection as an object of track ``number``, with the label of this one view."""
     candidate = detection.candidate
     return LabelledObject(
         track=number,

@@ -36,7 +36,10 @@ def finite_points(frame: Frame, indices: U4 | None = None) -> F4:
 
 
 def support_offset(item: LabelledObject, up: F4) -> float:
-    """Return the offset of an object's support along ``up`` (3,) from the sensor, metres."""
+    """Return the height of an object's support above the sensor, along ``up`` (3,), metres.
+
+    If the support is unknown, the bottom of the object's box takes its place.
+    """
     middle = float(np.dot(np.asarray(up, np.float64), item.box.center))
     half = float(item.box.size[2]) / 2
     return middle - (item.height_m if np.isfinite(item.height_m) else half)

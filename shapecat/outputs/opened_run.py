@@ -31,7 +31,8 @@ __all__ = ["Run", "RunFrame", "Table"]
 class Table:
     """A table of a run; reads the requested columns on demand.
 
-    ``widths`` are the lengths of lists that are equally long in all rows, for tables without rows.
+    ``widths`` holds, for columns of equally long lists, the length of these lists. It is needed
+    if the table has no rows.
     """
 
     path: Path
@@ -203,8 +204,8 @@ class Run:
     def labels(self) -> dict[int, str]:
         """The final category of each track of the tables, with corrections.
 
-        Deleted tracks are missing. A merged track has the category of the track it was merged with,
-        whose number the objects in `frames` have.
+        Deleted tracks are missing. A merged track has the category of the track that it was merged
+        with. The objects in `frames` have the number of that other track.
         """
         return {track: label.category for track, label in self._finished.labels.items()}
 
@@ -237,7 +238,7 @@ class Run:
     def frames(self, recording: str | Path | None = None) -> Iterator[RunFrame]:
         """Yield the frames with their points, in constant memory.
 
-        ``recording`` is its path; by default where it was processed.
+        ``recording`` is the path of the recording; None means the path where it was processed.
 
         Raises
         ------
@@ -246,7 +247,7 @@ class Run:
         """
         moved = None
         if recording is not None:
-            moved = Path(os.path.expanduser(recording))  # noqa: PTH111  the other needs a home
+            moved = Path(os.path.expanduser(recording))  # noqa: PTH111  Path fails without a home
         with open_source(self.info, moved) as source:
             shown = with_colour(self.labelled_frames(), source, self.info)
             for labelled, reading, coloured in shown:

@@ -1,4 +1,4 @@
-"""Scene graph: which objects and planes stand on which (the hierarchy of thesis 4.5)."""
+"""Scene graph: what each object or plane stands on (the hierarchy of thesis 4.5)."""
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -26,9 +26,10 @@ class Node:
 
 
 def format_tree(scene: Scene, describe: Callable[[Node], str]) -> str:
-    """Return the hierarchy as indented text, one node per line: planes by height, then objects.
+    """Return the scene as an indented tree, one node per line; planes come before objects.
 
-    A node with several parents is printed under each, marked ``=`` after the first time.
+    ``describe`` returns the text of a node. A node that stands on several others is printed under
+    each of them; after the first time, it is marked ``=`` and printed without what stands on it.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The objects of a frame on their supports, as a text tree, from the tables of a run."""
+"""A tree of text: what stands on what in a frame, from the tables of a run."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -26,7 +26,7 @@ _CANDIDATE_COLUMNS = (
     "touches_border",
     "occluded",
 )
-"""Columns of a detection that a candidate needs."""
+"""Columns of `detections.parquet` that make a candidate."""
 
 
 def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str:
@@ -73,7 +73,10 @@ def _read_scene(folder: Path, labelled: LabelledFrame) -> Scene:
 
 
 def _are_supported(below: Sequence[int | None]) -> bool:
-    """Return whether all objects stand on a plane, directly or through the objects ``below``."""
+    """Return whether each stack of objects has a lowest one, which stands on no object.
+
+    ``below`` holds, for each object, the index of the object directly below it, or None.
+    """
     supported: set[int | None] = {None}
     while more := {k for k, lower in enumerate(below) if lower in supported} - supported:
         supported |= more
@@ -99,7 +102,7 @@ def _candidate(row: dict[str, Any], planes: Sequence[Plane]) -> Candidate:
 def _rows(
     folder: Path, table: str, topic: str, frame: int, columns: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return the rows of a frame; of the other frames only the keys are read."""
+    """Return the rows of a frame in ``table``; of other rows, only topic and frame are read."""
     path = folder / f"{table}.parquet"
     groups = read_row_groups(path, ["topic", "frame"])
     keys = enumerate(key for group in groups for key in keys_of(group))
@@ -137,7 +140,7 @@ def _apply_labels(
 ) -> tuple[Scene, dict[int, LabelledObject]]:
     """Join the parts of merged objects, and leave deleted candidates out.
 
-    An object that stood on a deleted one stands on the surface below that. A merged object stands
+    An object on a deleted one now stands on what was below the deleted one. A merged object stands
     where its lowest part stands.
 
     Parameters
@@ -146,7 +149,7 @@ def _apply_labels(
 
     Returns
     -------
-    The changed scene, and the object of each of its candidates that belongs to one, by index.
+    The changed scene, and the labelled objects by the index of their candidate in this scene.
     """
     owner = {part: item for item in objects for part in item.detections}
     parts = {n: owner[n].detections if n in owner else (n,) for n in range(len(scene.candidates))}

@@ -11,14 +11,14 @@ __all__ = ["caption", "confidence_text", "different_names", "safe_name", "time_s
 
 _SAFE = re.compile(r"[\w .+&'()-]")
 _LONGEST_BYTES = 120
-"""File systems allow 255 bytes, of which others need some."""
+"""Longest safe name; file systems allow 255 bytes, but callers add to the name."""
 
 
 def caption(track: int, category: str, confidence: float) -> str:
     """Return the text beside an object: track, category and confidence.
 
-    The text of an unknown object omits the confidence: it belongs to the most probable category,
-    and would read as the certainty that the object is unknown.
+    The text of an unknown object omits the confidence. It is that of the most probable category,
+    but would be read as the certainty that the object is unknown.
 
     Examples
     --------
@@ -31,9 +31,9 @@ def caption(track: int, category: str, confidence: float) -> str:
 
 
 def confidence_text(confidence: float) -> str:
-    """Return a confidence with two decimals; 1.00 only if it rounds to 1.000.
+    """Return a confidence with two decimals; ``1.00`` only if it rounds to 1.000.
 
-    The text of a confidence rounded to three decimals, as in tracks.csv, is the same.
+    A confidence that was first rounded to three decimals, as in tracks.csv, gives the same text.
 
     Examples
     --------
@@ -72,7 +72,7 @@ def safe_name(text: str) -> str:
 
 
 def different_names(texts: Sequence[str]) -> list[str]:
-    """Return a `safe_name` for each text, with ``-2``, ``-3``, ... added to those that occur again.
+    """Return a `safe_name` for each text; ``-2``, ``-3``, ... tell repeated names apart.
 
     Examples
     --------

@@ -1,7 +1,7 @@
 """The annotated recording: all original messages, and the labelled objects.
 
-A finished MCAP file is copied byte for byte and extended; any other recording, and one in which
-the run has found damage, is rewritten as MCAP. Annotations use the encoding of the source.
+A complete MCAP file is copied byte for byte and extended. Any other recording, and a file in which
+the run has found damage, is rewritten as MCAP. Annotations use the encoding of the recording.
 """
 
 import json
@@ -36,13 +36,13 @@ __all__ = ["write_annotated"]
 _LIFETIME = 1.5
 """Lifetime of scene entities, as a multiple of the frame period."""
 _BUFFER = 4 << 20
-"""Two threads that write to the same file wait for each other, so each writes a lot at a time."""
+"""Bytes written at a time; many, since two threads that write to one file wait for each other."""
 _PERIOD_NS = 1_000_000_000
 """Frame period assumed for a stream with a single frame."""
 _LONGEST_NS = 3600 * 10**9
-"""Longest frame period: a clock that is set during a recording jumps by decades."""
+"""Limit of the frame period: a clock that is set during a recording may jump by decades."""
 _AHEAD = 64
-"""Frames among which the next one of a topic is found."""
+"""Number of following frames that are searched for the next frame of a topic."""
 _F = TypeVar("_F", Annotation, ImageFrame)
 
 
@@ -67,9 +67,9 @@ def write_annotated(
     ----------
     frames : the boxes to show in each frame, in the order of the recording.
     markers : whether to write ``/shapecat/markers`` for RViz, for ROS only.
-    images : the boxes to show on the colour images, in the order of the recording, for
-        ``/shapecat/image_annotations`` and, for ROS, ``/shapecat/detections_2d``, with the stamp,
-        frame id and log time of the image.
+    images : the boxes to show on the colour images, in the order of the recording. They are
+        written to ``/shapecat/image_annotations`` and, for ROS, ``/shapecat/detections_2d``, with
+        the stamp, frame id and log time of the image.
     image_topics : the topics of these images. If there are several, each has channels of its own:
         ``/shapecat/image_annotations/TOPIC``.
 
@@ -93,7 +93,10 @@ def write_annotated(
 
 @contextmanager
 def _copying(recording: McapRecording, path: Path, file: BinaryIO) -> Iterator[None]:
-    """Copy the data section of a recording to ``path`` while the block writes annotations."""
+    """Copy the data section of a recording to ``path`` while the block writes annotations.
+
+    ``file`` is the open file at ``path``; it is truncated after the annotations.
+    """
     length = recording.summary.data_end
     with ThreadPoolExecutor(1) as pool:  # the copy does not hold the interpreter lock
         copying = pool.submit(copy_bytes, recording.path, path, length)
@@ -110,7 +113,7 @@ def _encoded(
     *,
     markers: bool,
 ) -> tuple[list[AnnotationChannel], Iterator[EncodedMessage]]:
-    """Return the annotation channels, and an iterator that encodes their messages by log time."""
+    """Return the annotation channels, and their encoded messages in the order of log time."""
     annotations = _annotations(frames)
     first = next(annotations, None)
     encoding = _encoding(recording, first)
@@ -129,7 +132,7 @@ def _encoded(
 
 
 def _messages(frame: _F, encoders: Encoders[_F], first: int) -> Iterator[EncodedMessage]:
-    """Encode a frame for each channel; the channels are numbered from ``first``."""
+    """Encode a frame for each channel; ``first`` is the index of the first of these channels."""
     for number, (_, encode) in enumerate(encoders, start=first):
         yield EncodedMessage(number, frame.log_time_ns, encode(frame))
 
@@ -155,7 +158,11 @@ def _append(
 
 
 def _annotations(frames: Iterable[AnnotationFrame]) -> Iterator[Annotation]:
-    """Add lifetimes, from the time of the next frame, and tracks to delete, from earlier frames."""
+    """Add to each frame the lifetime of its boxes, and the tracks whose boxes it removes.
+
+    The lifetime follows from the time to the next frame. The removed boxes are those of earlier
+    frames whose track no sensor sees any more.
+    """
     visible: dict[str, set[int]] = {}
     for frame, period in _with_periods(frames):
         current = {box.track for box in frame.objects}
@@ -169,7 +176,7 @@ def _annotations(frames: Iterable[AnnotationFrame]) -> Iterator[Annotation]:
 def _with_periods(frames: Iterable[AnnotationFrame]) -> Iterator[tuple[AnnotationFrame, int]]:
     """Yield each frame with the time to the next one of its topic, ns.
 
-    The last frame gets the time since the one before.
+    The last frame of a topic gets the time since the frame before it.
     """
     source = iter(frames)
     following = deque(islice(source, _AHEAD))
@@ -187,13 +194,13 @@ def _with_periods(frames: Iterable[AnnotationFrame]) -> Iterator[tuple[Annotatio
 
 
 def _period(frame: AnnotationFrame, following: AnnotationFrame) -> int:
-    """Return the longer of the times between two frames, ns, by stamp and by viewers' log time."""
+    """Return the time between two frames, ns: by stamp or by log time, whichever is longer."""
     by_stamp = following.stamp_ns - frame.stamp_ns
     return max(1, by_stamp, following.log_time_ns - frame.log_time_ns)
 
 
 def _encoding(recording: Recording, first: Annotation | None) -> str:
-    """Return the encoding for annotations: the annotated topic's, else the most common one."""
+    """Return the encoding of the annotated topic, or else the most common one, for annotations."""
     if recording.kind == "ros1":
         return "cdr"
     topics = [topic for topic in recording.topics if topic.encoding in ENCODINGS]

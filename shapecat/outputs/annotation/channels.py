@@ -14,7 +14,8 @@ __all__ = ["encoder_for", "text_position"]
 def encoder_for(encoding: str, *, markers: bool) -> Encoders[Annotation]:
     """Return the annotation channels for an encoding, each with its encoder.
 
-    An unknown encoding is replaced by JSON. ``markers`` adds a channel for RViz, for ROS only.
+    An unknown encoding is replaced by JSON. ``markers`` adds a channel for RViz if the encoding
+    is one of ROS.
     """
     kinds = [
         MessageKind("/shapecat/detections", "vision_msgs/msg/Detection3DArray", _detections),
@@ -104,7 +105,7 @@ def _words(box: AnnotationBox, t: Types) -> Any:
 
 
 def _markers(annotation: Annotation, t: Types) -> Any:
-    """Make a cube and a text for each object."""
+    """Make a cube and a text for each object; delete those of the tracks that are gone."""
     header, lifetime = _header(annotation, t), t["Time"](annotation.lifetime_ns)
 
     def marker(kind: str, track: int, **fields: Any) -> Any:
@@ -162,6 +163,6 @@ def text_position(box: AnnotationBox) -> tuple[float, float, float]:
     x, y, z = box.center
     qx, qy, qz, qw = box.orientation
     rise = box.size[2] / 2 + 0.03
-    # The third column of the rotation.
+    # The z axis of the box: the third column of its rotation matrix.
     up = (2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy))
     return x + rise * up[0], y + rise * up[1], z + rise * up[2]

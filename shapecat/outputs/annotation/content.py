@@ -28,7 +28,7 @@ class AnnotationChannel(NamedTuple):
 
 
 class Annotation(NamedTuple):
-    """A frame to write, the lifetime of its entities, and the tracks to delete in it."""
+    """A frame to write, how long viewers show its boxes, and the tracks whose boxes it removes."""
 
     frame: AnnotationFrame
     lifetime_ns: int
@@ -41,7 +41,7 @@ class Annotation(NamedTuple):
 
 
 Encoders = list[tuple[AnnotationChannel, Callable[[_T], bytes]]]
-"""Channels, each with the function that encodes a frame as its message."""
+"""Channels, each with the function that encodes a frame as a message of the channel."""
 
 
 class EncodedMessage(NamedTuple):

@@ -1,4 +1,4 @@
-"""Make and encode messages in each encoding, with the schemas of our package."""
+"""Make and encode messages as CDR, ROS 1, JSON or protobuf, with the schemas in `schemas/`."""
 
 import json
 from collections import defaultdict
@@ -18,9 +18,10 @@ from shapecat.recordings.decoding.protobuf import message_class
 __all__ = ["ENCODINGS", "MessageKind", "Types", "encoders_of"]
 
 Types = Mapping[str, Callable[..., Any]]
-"""Makes a message of each type, named without its package, from its fields.
+"""Functions that make messages, by the name of the message type without its package.
 
-``Time`` is made from nanoseconds, and is also a duration.
+Each takes the fields of its message as keywords. Only ``Time``, which is also the type of
+durations, takes nanoseconds.
 """
 _T = TypeVar("_T")
 _FOXGLOVE = "foxglove."
@@ -37,14 +38,17 @@ _INCOMPLETE = (
     "vision_msgs/msg/Pose2D",
     "visualization_msgs/msg/Marker",
 )
-"""Messages whose other fields are zero in ROS; giving all messages zeros first would take time."""
+"""ROS types of which only some fields are set; the others are zero.
+
+Only messages of these types start as zeros, since that takes time.
+"""
 
 
 class MessageKind(NamedTuple, Generic[_T]):
-    """The messages of a channel.
+    """The messages of a channel: topic, name of the type, and the function that makes a message.
 
-    ``name`` is a Foxglove type such as ``foxglove.SceneUpdate``, for all encodings, or a ROS type,
-    for ROS alone.
+    ``name`` is a Foxglove type, such as ``foxglove.SceneUpdate``, which is written in all
+    encodings, or a ROS type, which is written only in the encodings of ROS.
     """
 
     topic: str
@@ -53,7 +57,7 @@ class MessageKind(NamedTuple, Generic[_T]):
 
 
 def encoders_of(encoding: str, kinds: Iterable[MessageKind[_T]]) -> Encoders[_T]:
-    """Return the channels of those kinds of messages that an encoding has, each with its encoder.
+    """Return a channel and its encoder for each kind of message that the encoding supports.
 
     An unknown encoding is replaced by JSON.
     """
@@ -68,8 +72,8 @@ def encoders_of(encoding: str, kinds: Iterable[MessageKind[_T]]) -> Encoders[_T]
 class _Encoding(NamedTuple):
     """Types, encoder and schemas of the messages in an encoding.
 
-    ``encode`` takes a message and the name of its type; ``schema`` returns name, encoding and
-    content of the schema of a type.
+    ``encode`` takes a message and the name of its type. ``schema`` takes the name of a type, and
+    returns the name, encoding and content of its schema.
     """
 
     name: str
@@ -107,7 +111,7 @@ def _protobuf() -> _Encoding:
 
 
 def _plain(*time_fields: str) -> Types:
-    """Return all types as dictionaries."""
+    """Return types whose messages are dictionaries; ``time_fields`` name seconds, nanoseconds."""
 
     def time(time_ns: int) -> dict[str, int]:
         return dict(zip(time_fields, divmod(time_ns, 10**9), strict=True))
@@ -127,7 +131,7 @@ def _ros(*, ros1: bool) -> _Encoding:
     made = types["Time"]
 
     def time(time_ns: int) -> Any:
-        """Return a time; its seconds have 31 bits."""
+        """Return a time; its seconds are limited to 31 bits."""
         seconds, nanoseconds = divmod(time_ns, 10**9)
         return made(sec=min(seconds, 2**31 - 1), nanosec=nanoseconds)
 
@@ -149,7 +153,7 @@ ENCODINGS: dict[str, Callable[[], _Encoding]] = {
     "json": _json,
     "protobuf": _protobuf,
 }
-"""By the encoding of the source: files with mixed encodings break ROS tools."""
+"""Annotations have the encoding of the recording: a file with mixed encodings breaks ROS tools."""
 
 
 def _file(name: str, suffix: str) -> bytes:
@@ -179,7 +183,7 @@ def _typestore(ros1: bool) -> Typestore:  # noqa: FBT001  # a cache key
 
 
 def _zeros(store: Typestore, name: str) -> dict[str, Any]:
-    """Return the fields of a message that is all zero, or empty."""
+    """Return zero or an empty value for each field of a message type."""
     fields: dict[str, Any] = {}
     definitions: Any = store.fielddefs[name][1]
     for field, (node, detail) in definitions:

@@ -18,7 +18,7 @@ _LINE_LOOP = 2
 
 
 class ImageBox(NamedTuple):
-    """An object on an image: left, top, width and height in pixels."""
+    """An object on an image; ``box`` is its left, top, width and height in pixels."""
 
     track: int
     category: str
@@ -32,7 +32,7 @@ class ImageBox(NamedTuple):
 
     @property
     def corners(self) -> list[tuple[float, float]]:
-        """The corners of the box from the top left one clockwise, on the borders of its pixels."""
+        """The corners (x, y) of the box in pixels, clockwise from the top left."""
         left, top, width, height = (float(value) for value in self.box)
         right, bottom = left + width, top + height
         return [(left, top), (right, top), (right, bottom), (left, bottom)]
@@ -49,9 +49,9 @@ class ImageFrame(NamedTuple):
 
 
 def read_image_frames(folder: Path, tracks: LabelledTracks) -> Iterator[ImageFrame]:
-    """Yield the annotations of the colour images of a run; see `read_nearest_masks`.
+    """Yield the objects on each colour image of a run; see `read_nearest_masks`.
 
-    Unorganized clouds have no colour image.
+    Images of a single row, the colours of unorganized clouds, are left out.
     """
     for key, masks in read_nearest_masks(folder):
         if masks.height <= 1:
@@ -68,8 +68,8 @@ def read_image_frames(folder: Path, tracks: LabelledTracks) -> Iterator[ImageFra
 def image_encoders_for(encoding: str, topics: Iterable[str]) -> dict[str, Encoders[ImageFrame]]:
     """Return the channels that annotate the images of each topic, each with its encoder.
 
-    If there are several topics, each channel name ends in its topic, since viewers draw all
-    messages of a channel on an image. An unsupported message encoding becomes JSON.
+    If there are several topics, the name of each channel ends in the topic of its images, since
+    viewers draw all messages of a channel on one image. An unknown encoding is replaced by JSON.
     """
     names, found = list(topics), {}
     for name in names:

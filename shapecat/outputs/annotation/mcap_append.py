@@ -26,7 +26,7 @@ from shapecat.recordings.containers.mcap_summary import Summary
 __all__ = ["Appender", "copy_bytes"]
 
 _CHUNK_BYTES = 256 << 10
-"""Small chunks, since a reader that sorts by time always holds one of them."""
+"""Size of the chunks; small, since a reader that sorts messages by time keeps one in memory."""
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")
 """A record's opcode and length; a message's channel, sequence, log time and publish time."""
@@ -41,7 +41,7 @@ def _reserve(file: BinaryIO, length: int) -> None:
     """Reserve disk space for ``length`` bytes, and some for annotations.
 
     A full disk is then noticed early. Without reserved space, ext4 would write out the whole file
-    when it is renamed over an older one, which takes as long as the copy.
+    when the file is renamed over an older one, which takes as long as the copy.
     """
     if not hasattr(os, "posix_fallocate"):
         return
@@ -50,14 +50,15 @@ def _reserve(file: BinaryIO, length: int) -> None:
         with suppress(OSError):
             os.posix_fallocate(file.fileno(), length, length // 8)
     except OSError as error:
-        if error.errno not in {errno.EINVAL, errno.EOPNOTSUPP}:  # not every file system can
+        if error.errno not in {errno.EINVAL, errno.EOPNOTSUPP}:  # some file systems cannot reserve
             raise
 
 
 def copy_bytes(source: Path, target: Path, length: int) -> None:
-    """Copy the first ``length`` bytes of a file over those of another, in the kernel if possible.
+    """Copy the first ``length`` bytes of a file to the start of an existing file.
 
-    Disk space is also reserved behind these bytes: truncate the target when everything is written.
+    The kernel copies them if it can. Disk space is reserved behind these bytes, too: truncate the
+    target when everything is written.
 
     Raises
     ------
@@ -88,18 +89,19 @@ class _Chunk:
 
     data: bytearray = field(default_factory=bytearray)
     entries: dict[int, list[int]] = field(default_factory=lambda: defaultdict(list))
-    """For each channel, log time and offset of each message, alternating."""
+    """For each channel, the log times and offsets of its messages, alternating."""
 
 
 class Appender:
     """Adds channels, messages and metadata to a data section, then writes the new summary.
 
-    Use it as a context manager: a thread compresses and writes filled chunks.
+    A thread compresses and writes filled chunks. Use the appender as a context manager, which ends
+    this thread.
 
     Parameters
     ----------
     file : open for writing, positioned at the end of the original data section.
-    summary : the summary of the original.
+    summary : the summary of the original file.
     compression : compression of the new chunks: ``zstd``, ``lz4`` or empty.
     """
 
@@ -174,7 +176,7 @@ class Appender:
         self._metadata.append(records.MetadataIndex(offset=offset, length=length, name=name))
 
     def finish(self) -> None:
-        """Complete the file: write a summary of the original and the additions, and the footer."""
+        """Complete the file: write the footer, and a summary of all that the file now holds."""
         self._flush(0)
         self._write([records.DataEnd(0)])
         start = self._file.tell()
@@ -221,7 +223,7 @@ class Appender:
         )
 
     def _flush(self, waiting: int) -> None:
-        """Submit the chunk if it has messages; wait until at most ``waiting`` are unwritten."""
+        """Submit the chunk if it has messages; wait until at most ``waiting`` chunks are left."""
         if self._chunk.entries:
             self._waiting.append(self._writer.submit(self._write_chunk, self._chunk))
             self._chunk = _Chunk()

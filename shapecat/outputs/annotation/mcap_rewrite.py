@@ -1,4 +1,4 @@
-"""Rewrite a recording as MCAP, with the annotations among its messages by time."""
+"""Rewrite a recording as MCAP, with its messages and the annotations in the order of log time."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,7 +20,7 @@ from shapecat.recordings.decoding.decoders import LIBRARY_ERRORS, schema_of
 __all__ = ["rewrite"]
 
 _Registered = tuple[int, Callable[[bytes | memoryview], memoryview] | None]
-"""The number of a channel in the written file, and the conversion of its messages."""
+"""The number of a channel in the written file, and the function that converts its messages."""
 
 
 def rewrite(
@@ -33,6 +33,12 @@ def rewrite(
     """Write the messages of a recording, its attachments and metadata, and the annotations.
 
     Messages of ROS 1 bags are converted to CDR, or wrapped by `wrap_raw` if that is impossible.
+
+    Parameters
+    ----------
+    channels : the channels of the annotations.
+    items : the annotations by log time, each with the index of its channel in ``channels``.
+    metadata : content of the metadata record ``shapecat``.
     """
     writer = Writer(file, compression=CompressionType.LZ4)
     parts = [part for part in recording.parts() if isinstance(part, McapRecording)]

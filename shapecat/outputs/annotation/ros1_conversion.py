@@ -1,4 +1,4 @@
-"""Convert ROS 1 messages to ROS 2 messages: same fields, other encoding."""
+"""Convert ROS 1 messages to ROS 2: the fields stay, only their encoding changes."""
 
 import re
 from collections.abc import Callable
@@ -43,10 +43,10 @@ _LATCHED = Qos(
 """The quality of service that corresponds to a latched ROS 1 topic."""
 _HEADER = "std_msgs/msg/Header"
 _FIELD = re.compile("[a-z](_?[a-z0-9])*")
-"""Names of fields that ROS 2 allows."""
+"""Field names that ROS 2 allows."""
 
 _KEPT = 64
-"""Number of definitions for which types are kept: thousands of topics may share one."""
+"""Largest number of definitions in the cache; thousands of topics may share one definition."""
 
 _ConvertedChannel = tuple[AnnotationChannel, Callable[[bytes | memoryview], memoryview]]
 
@@ -54,9 +54,9 @@ _ConvertedChannel = tuple[AnnotationChannel, Callable[[bytes | memoryview], memo
 def convert_channel(channel: Channel) -> _ConvertedChannel | None:
     """Convert a ROS 1 channel to ROS 2.
 
-    Types keep the definition in the bag, but their fields get names that ROS 2 allows (``O_T_EE``
-    becomes ``o_t_ee``), as in its own types (``K`` of CameraInfo is ``k``). Only the sequence
-    number of headers is lost, since ROS 2 has none.
+    Types keep their definition from the bag. Only fields whose names ROS 2 does not allow are
+    renamed: ``O_T_EE`` becomes ``o_t_ee``, and ``K`` of CameraInfo becomes ``k``, as ROS 2 itself
+    names it. The sequence numbers of headers are lost, since ROS 2 has none.
 
     Returns
     -------
@@ -76,7 +76,7 @@ def convert_channel(channel: Channel) -> _ConvertedChannel | None:
 
 @lru_cache(_KEPT)
 def _ros2_types(channel: Channel, name: str) -> tuple[Typestore, bytes]:
-    """Return the types that convert a channel's messages, and the ROS 2 definition of ``name``."""
+    """Return the types of a channel for ROS 2, and the ROS 2 definition of the type ``name``."""
     types = dict(typestore_of(channel).fielddefs)
     if name != channel.type:
         types[name] = types.pop(channel.type)
@@ -90,9 +90,9 @@ def _ros2_types(channel: Channel, name: str) -> tuple[Typestore, bytes]:
 
 
 def _renamed(constants: Any, fields: Any) -> Any:
-    """Rename the fields of a definition whose names ROS 2 does not allow.
+    """Return a message definition in which ROS 2 allows the names of all fields.
 
-    Strict readers would refuse the whole file.
+    Strict readers refuse a file with any other name.
     """
     names: list[str] = []
     for name, _ in fields:
@@ -112,9 +112,9 @@ def raw_channel(topic: str) -> AnnotationChannel:
 
 
 def wrap_raw(channel: Channel, data: bytes | memoryview) -> memoryview:
-    """Wrap a message that cannot be converted, with its type, encoding and definition.
+    """Return a CDR message that holds an unconverted message, its type, encoding and definition.
 
-    Most ROS tools cannot play or open a file with two encodings.
+    The whole file then has one encoding. Most ROS tools cannot open a file with two.
     """
     store = _raw_store()
     message = store.types[_RAW_TYPE](

@@ -24,9 +24,9 @@ def write_coco(out: Path, images: Images, categories: Sequence[str]) -> int:
     """Write images/SPLIT/ and annotations/instances_SPLIT.json; return the number of objects.
 
     Masks are compressed run lengths. Objects with an uncertain label have ``iscrowd`` set, so that
-    evaluation ignores them, and are not counted. ``track_id`` is unique in the data set;
-    ``attributes`` holds the run, the track number in that run, whether another object hides a part
-    and whether the border of the depth image cuts the object: its mask then lacks the rest.
+    evaluation ignores them, and are not counted. ``track_id`` is unique in the data set.
+    ``attributes`` holds the run, the track number in that run, ``occluded`` (another object hides a
+    part) and ``truncated`` (the border of the depth image cuts the object, and thus its mask).
     """
     tracks: dict[tuple[str, int], int] = {}
     splits: dict[str, dict[str, list[dict[str, Any]]]] = {}
@@ -115,4 +115,4 @@ def write_yolo(out: Path, images: Images, categories: Sequence[str]) -> int:
 
 
 DATASETS = {"coco": write_coco, "yolo": write_yolo}
-"""Formats that merge several runs into one data set."""
+"""The writer of each format that merges several runs into one data set."""

@@ -46,7 +46,7 @@ class Origin(NamedTuple):
 
     @classmethod
     def read(cls, instance: str) -> "Origin | None":
-        """Return the origin in the name of an instance; None if no run made it."""
+        """Return the origin that the name of an instance holds; None if no run made it."""
         if match := _INSTANCE.fullmatch(instance):
             return cls(match[1], float(match[2] or 0), float(match[3] or "inf"))
         return None
@@ -64,9 +64,9 @@ class Origin(NamedTuple):
 def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
     """Add the views of a run to a data set; return their number.
 
-    Earlier views of the same topics of the recording are replaced, whatever the name of their run,
-    so that none keeps an outdated label or is there twice; views of another time range stay.
-    Deleted tracks are left out; ``unknown`` is a category like any other.
+    Earlier views of the same topics of the recording are replaced if the time ranges overlap, even
+    if their run had another name. No view then has an outdated label or occurs twice. Deleted
+    tracks are left out; ``unknown`` is a category like any other.
 
     Raises
     ------

@@ -45,11 +45,11 @@ class Selection:
     Attributes
     ----------
     every : take every n-th frame of a stream.
-    per_track : number of views per track, chosen to differ; only their frames are taken. 0 takes
-        all views.
+    per_track : take only frames with chosen views: of each track, at most so many, which differ as
+        much as possible. 0 takes all frames.
     min_confidence : objects with a lower confidence are not used for training.
-    corrected_only : only objects with a label from a person are used for training.
-    depth : the images are depth images in millimetres, not colour images.
+    corrected_only : whether only objects with a label from a person are used for training.
+    depth : whether the images are depth images in millimetres instead of colour images.
     val : fraction of the recordings for the validation split, from 0 to below 1.
     """
 
@@ -87,8 +87,8 @@ class DatasetObject(NamedTuple):
 def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
     """Return ``train`` or ``val`` for each run; runs of the same recording are in the same split.
 
-    The random draw depends on the content of the recordings, so that adding runs changes little. A
-    single recording goes to the training split.
+    Hashes of the recordings' content replace random numbers, so that further runs change few
+    splits. A single recording goes to the training split.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
 
 
 def image_stems(runs: Sequence[FinishedRun]) -> list[dict[str, str]]:
-    """Return, for each run, a prefix of image names for each topic; no two are equal."""
+    """Return, for each run, the prefix of the image names of each topic; all prefixes differ."""
     names = different_names([run.name for run in runs])
     topics = [run.info["options"]["topics"] for run in runs]
     stems = [
@@ -128,9 +128,9 @@ def images_of(
 
     Parameters
     ----------
-    recording : path of the recording; by default where it was processed.
-    stems : the prefix of image names of each topic.
-    left_out : counts the other frames by reason.
+    recording : path of the recording; None means the path where it was processed.
+    stems : the prefix of the image names of each topic.
+    left_out : counter to which frames without such an image are added, by reason.
     observe : called after each frame of the run, even if it is left out.
 
     Raises
@@ -161,7 +161,7 @@ def images_of(
 
 
 def _is_sure(item: LabelledObject, selection: Selection, corrected: set[int]) -> bool:
-    """Return whether an object has a label to train on, which *unknown* never is."""
+    """Return whether the label of an object is certain enough for training; *unknown* never is."""
     if item.category == UNKNOWN:
         return False
     certain = item.confidence >= selection.min_confidence and not selection.corrected_only
@@ -176,7 +176,7 @@ def _image(
     selection: Selection,
     corrected: set[int],
 ) -> DatasetImage | None:
-    """Return the image of a frame; None if it has none."""
+    """Return the image of a frame, named ``name`` with a suffix; None if the frame has no image."""
     image = _depth_file(labelled, frame) if selection.depth else _colour_file(frame, coloured)
     if image is None:
         return None
@@ -232,7 +232,7 @@ def _chosen(
         key = (labelled.topic, labelled.index)
         place, apart = (*key, 0), 0
         if image is not None:
-            # Stamps alone repeat after a clock was set back.
+            # After a clock is set back, different images may have the same stamp.
             place = (image.topic, image.stamp_ns, image.log_time_ns)
             apart = abs(labelled.stamp_ns - image.stamp_ns)
         if place not in best or apart < best[place][0]:
@@ -262,7 +262,7 @@ def thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFra
 
 
 def _view(labelled: LabelledFrame, item: LabelledObject) -> F8:
-    """Return features (8,) to choose different views: direction, distance, pixels and shape."""
+    """Return features (8,) of a view: direction, distance, number of pixels, and shape."""
     pose, center = labelled.fixed_from_sensor, np.asarray(item.box.center, np.float64)
     distance = float(np.linalg.norm(center))
     way = -center / max(distance, 1e-6)
@@ -273,7 +273,10 @@ def _view(labelled: LabelledFrame, item: LabelledObject) -> F8:
 
 
 def _different(views: F8, count: int) -> list[int]:
-    """Choose views (n, 8) by farthest-point sampling, starting with the one with most pixels."""
+    """Return the indices of ``count`` views (n, 8) that differ most.
+
+    They are found by farthest-point sampling, which starts with the view of most pixels.
+    """
     chosen = [int(views[:, 4].argmax())]
     apart = np.linalg.norm(views - views[chosen[0]], axis=1)
     while len(chosen) < min(count, len(views)):

@@ -71,7 +71,7 @@ FORMATS: dict[str, Write] = {
     "point-labels": write_point_labels,
 }
 BOX_FORMATS = ("kitti", "labelcloud")
-"""Formats with boxes, which are full or visible; `shapecat export` repeats the names."""
+"""Formats with full or visible boxes, as the caller chooses; `cli/export.py` repeats the names."""
 _MARK = "export.json"
 
 
@@ -89,16 +89,16 @@ def export_run(
     """Export the labels of a finished run with their points.
 
     Crops are added to the data set ``out``. The other formats are written to ``out/NAME``, where
-    NAME is the name of the run folder; only an earlier export is replaced. Frames at an unknown
-    place in the fixed frame are left out: their objects have no tracks, and so no labels.
+    NAME is the name of the run folder; only an earlier export is replaced. Frames without a pose in
+    the fixed frame are left out if it exists: their objects have no tracks, and so no labels.
 
     Parameters
     ----------
     format : a key of `FORMATS`.
     every : export every n-th frame of a stream.
     visible_boxes : whether boxes enclose only the visible part of objects, not the whole.
-    categories : the categories of all runs that are exported together, so that their numbers agree.
-    recording : path of the recording; by default where it was processed.
+    categories : the categories of all runs that are exported together; they are numbered alike.
+    recording : path of the recording; None means the path where it was processed.
     observe : called with the phase, the number of frames done, and the total.
 
     Returns
@@ -151,7 +151,7 @@ def export_dataset(
     Parameters
     ----------
     format : a key of `DATASETS`.
-    recording : path of the recording of a single run; by default where it was processed.
+    recording : path of the recording, for a single run; None means where it was processed.
     observe : called with the phase, the number of frames done, and the total.
 
     Raises
@@ -227,7 +227,7 @@ def _staged(
     about: Mapping[str, Any],
     write: Callable[[Path], int],
 ) -> int:
-    """Let ``write`` fill a folder that appears when complete, with the marker of an export."""
+    """Let ``write`` fill ``target``, which appears when complete; return the number of objects."""
     recover(target, _made_by_export)
     _require_own(target, about)
     with staged(target, _made_by_export) as hidden:
@@ -241,14 +241,14 @@ def _staged(
 
 
 def _mark(folder: Path, about: Mapping[str, Any]) -> None:
-    """Write the marker of an export: its source, and the names that it made."""
+    """Write export.json, the marker of an export: ``about``, and the names in its folder."""
     names = sorted(path.name for path in folder.iterdir() if path.name != _MARK)
     with replacing(folder / _MARK) as path:
         path.write_text(json.dumps({**about, "made": names}, indent=1) + "\n", "utf-8")
 
 
 def _read_mark(folder: Path) -> dict[str, Any]:
-    """Return the marker of an export; empty if it has none."""
+    """Return the content of export.json in a folder; empty if it is missing or invalid."""
     with suppress(OSError, ValueError, TypeError, RecursionError):
         about = json.loads((folder / _MARK).read_text("utf-8"))
         if isinstance(about, dict) and isinstance(about.get("made"), list):
@@ -271,7 +271,7 @@ def _made_by_export(folder: Path) -> Collection[str] | None:
 
 
 def _tracked(frames: Iterable[LabelledFrame], placed: Collection[str]) -> Iterator[LabelledFrame]:
-    """Leave out frames without pose of topics that are tracked in the fixed frame, ``placed``."""
+    """Leave out untracked frames: those of topics ``placed`` in the fixed frame without a pose."""
     return (f for f in frames if f.fixed_from_sensor is not None or f.topic not in placed)
 
 
@@ -312,8 +312,8 @@ def _require_own(target: Path, about: Mapping[str, Any]) -> None:
 def _covers(new: Any, old: Any) -> bool:
     """Return whether the time range ``new`` includes ``old``.
 
-    Data sets have no range, which is None. A limit that is None is the start or end of the
-    recording.
+    A range is (start, end) in seconds, where None is the start or end of the recording; a data set
+    has no range, but None.
     """
     if new is None or old is None:
         return new is old

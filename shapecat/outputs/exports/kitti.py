@@ -81,14 +81,14 @@ def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
 
 
 class _View(NamedTuple):
-    """The camera for 2D boxes and P2, None for clouds; ``pose`` is ``camera_from_sensor``."""
+    """The camera of 2D boxes and ``P2``, None for clouds; ``pose`` is ``camera_from_sensor``."""
 
     camera: Camera | None
     pose: Pose
 
 
 def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None) -> _View:
-    """Write the colour image of a frame and return its camera; without one, the depth camera."""
+    """Write the colour image of a frame, and return its camera; else return the depth camera."""
     depth_view = _View(frame.camera, IDENTITY)
     if coloured is None or coloured.view.image.height <= 1:
         return depth_view
@@ -109,7 +109,7 @@ def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None
 
 
 def kitti_type(category: str) -> str:
-    """Return the KITTI type of a category: a type cannot hold spaces."""
+    """Return the KITTI type of a category, in which ``_`` replaces spaces."""
     return category.replace(" ", "_")
 
 

@@ -91,7 +91,7 @@ def _write_masks(out: Path, name: str, frame: Frame, labels: U4) -> None:
 
 
 def depth_in_mm(depth: F4) -> U2:
-    """Return a depth image (h, w), metres, in millimetres; 0, no depth, beyond 65.535 m."""
+    """Convert a depth image (h, w) from metres to millimetres; beyond 65.535 m, depth is 0."""
     millimetres = np.round(depth.astype(np.float64) * 1000)
     return np.where(millimetres <= _LARGEST, millimetres, 0).astype(np.uint16)
 

@@ -58,7 +58,7 @@ def card_html(card: Card, categories: Sequence[str], names: Sequence[str], end: 
     Parameters
     ----------
     categories : in the order of the posterior.
-    names : all categories, starting with unknown: the index of each is its digit key.
+    names : all categories, starting with unknown; the index of a category is its digit key.
     end : time at the end of the last track, seconds since the first frame.
     """
     row, line = card.row, card.timeline
@@ -182,7 +182,7 @@ def _few(count: int) -> I4:
 
 
 def _spans(seconds: F8, visible: Bool, scale: float) -> list[tuple[float, float]]:
-    """Return start and end of each interval in which the track was detected without a gap."""
+    """Return start and end, times ``scale``, of each interval of detections without a gap."""
     changes = np.diff(visible.astype(int), prepend=0, append=0)
     starts, ends = np.flatnonzero(changes == 1), np.flatnonzero(changes == -1) - 1
     return [(seconds[a] * scale, seconds[b] * scale) for a, b in zip(starts, ends, strict=True)]

@@ -19,10 +19,10 @@ from shapecat.types import ImageMasks
 __all__ = ["Choice", "choose_frames"]
 
 _CANDIDATES = 4
-"""Views of a track that are read again: a typical large one of each quarter of them."""
+"""Number of views of a track that are read again: a large one from each quarter of the track."""
 _RANK = 0.8
-"""Rank of the chosen view among those of a quarter, 1 for the largest. The largest masks often
-include a neighbour or a piece of the table."""
+"""Quantile, by size, of the chosen view in its quarter. It is below 1 because the largest masks
+often include a neighbour or a piece of the table."""
 _STRIP = 12
 _PARTIAL = 0.2
 """Weight of a view that is cut off by the image border or partly occluded."""
@@ -100,9 +100,9 @@ def _areas(masks: Iterator[tuple[Key, ImageMasks]]) -> dict[Detected, tuple[floa
 
 
 def _representative_views(views: Sequence[_View]) -> list[_View]:
-    """Return a typical large view of each of `_CANDIDATES` parts of a track, if possible complete.
+    """Return a large view from each of `_CANDIDATES` parts of a track.
 
-    Among equal views, the first is taken.
+    It is complete if the part has a complete view. Among equal views, the first is taken.
     """
     ends = np.linspace(0, len(views), min(_CANDIDATES, len(views)) + 1).astype(int)
     chosen = []
@@ -120,8 +120,8 @@ def _strip(
 
     ``stamps`` are the stamp (ns) and the key of each frame, sorted by time.
 
-    In each part it is the frame with the most tracks that no earlier one shows; on ties, the one
-    with the most tracks, then the one nearest to the middle.
+    It is the frame with the most tracks that no earlier frame of the strip shows. Among equal
+    frames, it is the one with the most tracks, then the one nearest to the middle of the part.
     """
     covered: set[tuple[str, int]] = set()
     strip = {}

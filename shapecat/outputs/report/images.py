@@ -35,7 +35,7 @@ _GOOD_PX = 160
 _GOOD_DETAIL = 12.0
 """Standard deviation of the Laplacian at which sharpness is 0.5, grey levels."""
 _NEARER = 0.015
-"""A pixel occludes its neighbour if it is nearer by this many metres plus this fraction."""
+"""A pixel occludes its neighbour if it is nearer by this many metres plus this share of depth."""
 _FAR_M = 6.0
 _SAME_SURFACE = 0.02
 """Neighbours whose inverse depths differ by less than this fraction are on the same surface."""
@@ -57,7 +57,7 @@ class FramePicture(Record):
     ----------
     masks : the mask of each object of the frame, in order.
     hidden : (n,) fraction of each object's outline along which something nearer occludes it.
-    image_frame : the frame as a depth image, for a cloud from a virtual camera.
+    image_frame : the frame as a depth image; that of a cloud is seen by a virtual camera.
     colour : (h, w, 3) red, green, blue; None if the depth image is shown.
     """
 
@@ -109,13 +109,16 @@ def prepare_picture(
 
 
 def _organized(labelled: LabelledFrame, frame: Frame) -> tuple[Frame, list[U4]] | None:
-    """Return a frame as a depth image, and its objects as flat pixel indices; or None."""
+    """Return a frame as a depth image, and its objects as flat indices of pixels.
+
+    Return None for a cloud that no virtual camera can show.
+    """
     indices = [item.indices for item in labelled.objects]
     if frame.depth is not None:
         return frame, indices
     points = frame.xyz()
     turn = _upright(points, labelled.up)
-    points = freeze(points @ turn.T, "n 3", "f4")  # read-only, as kernels know points
+    points = freeze(points @ turn.T, "n 3", "f4")  # kernels are compiled for read-only points
     view = virtual_image(points, range_m=_FAR_M)
     if view is None or view.crowded > OUTPUT.crowded:
         up, rng = np.array([0.0, -1.0, 0.0]), np.random.default_rng(0)
@@ -166,7 +169,7 @@ def _hidden_share(depth: F4 | None, pixels: U4) -> float:
 def _shaded(frame: Frame, window: Window) -> U1:
     """Return a part of a depth image as a shaded relief (h, w, 3), lit from above left.
 
-    A plane is linear in inverse depth, so normals follow from the slopes of inverse depth.
+    The inverse depth of a plane is linear in the image, so that its slopes give the normals.
     """
     left, top, right, bottom = window
     depth, camera = np.asarray(frame.depth)[top:bottom, left:right], frame.camera
@@ -202,7 +205,7 @@ def _smooth(inverse: F4, passes: int = 6) -> F4:
 
 
 def _slope(inverse: F4, axis: int) -> F4:
-    """Return slopes (h, w) along an axis: the smaller one-sided difference keeps edges sharp."""
+    """Return the smaller one-sided difference (h, w) along an axis, which keeps edges sharp."""
     step = np.diff(inverse, axis=axis)
     ends = [(1, 0) if k == axis else (0, 0) for k in (0, 1)]
     before = np.pad(step, ends, mode="edge")
@@ -288,7 +291,10 @@ def _detail(image: FramePicture, mask: Mask) -> float:
 
 
 def _inside(mask: Bool, window: Window, shape: Sequence[int]) -> Bool:
-    """Return a mask (h, w) cut to a crop, and eroded, since the outline adds contrast."""
+    """Return a mask, cut to a window and resized to ``shape``, without the rim of the object.
+
+    The rim is removed because the edge of an object adds contrast.
+    """
     left, top, right, bottom = window
     mask_image = Image.fromarray(mask[top:bottom, left:right])
     small = mask_image.resize((shape[1], shape[0]), Image.Resampling.NEAREST)

@@ -37,8 +37,9 @@ _SCRIPTS = ("labels.js", "meaning.js", "saving.js", "cards.js", "frames.js", "ke
 class Listed:
     """A run in the index.
 
-    ``categories`` counts tracks, merged ones once; ``unsure`` and ``checked`` are numbers of tracks
-    before merging; ``faces`` are some pictures as data URIs.
+    ``categories`` counts tracks, where merged tracks count as one. ``unsure`` is the number of
+    uncertain tracks without a label, ``checked`` that of tracks with a label, both before merging.
+    ``faces`` are pictures of some tracks as data URIs.
     """
 
     link: str
@@ -70,7 +71,7 @@ def run_page(
     frames : the frames of the strip.
     stages : (frames,) seconds of each stage.
     length_s : time from the first to the last frame, seconds.
-    notes : warnings in addition to the run's.
+    notes : warnings to show after those of the run.
     index : link to the index of several runs; None if there is none.
     served : whether corrections are sent to a server; if not, the page offers a table to download.
     """
@@ -247,7 +248,7 @@ def _data(names: Sequence[str], run: Mapping[str, Any], table: TrackTable, *, se
 
 
 def _key(run: Mapping[str, Any], table: TrackTable) -> str:
-    """Return the name under which a browser keeps corrections: equal for all pages of a run."""
+    """Return the name under which a browser stores corrections; all pages of a run share it."""
     tracks = sorted(row.track for row in table.rows)
     return hashlib.sha256(json.dumps([run.get("work", ""), tracks]).encode()).hexdigest()[:16]
 

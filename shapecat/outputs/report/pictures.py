@@ -34,7 +34,7 @@ __all__ = ["Pictures", "StripFrame", "TrackPictures", "take_pictures"]
 class TrackPictures(NamedTuple):
     """The best view of a track: crop, drawings of the surface, and size of the full box in metres.
 
-    ``crop`` is None if the recording or the object cannot be shown.
+    ``crop`` is None if the recording cannot be read, or if no pixel shows the object.
     """
 
     crop: Crop | None
@@ -62,7 +62,7 @@ class StripFrame(NamedTuple):
 class Pictures:
     """All pictures of a run.
 
-    ``reason`` says why surfaces are drawn from their meshes alone; it is empty if they are not.
+    ``reason`` says why surfaces are drawn without points; it is empty if they have points.
     """
 
     tracks: Mapping[int, TrackPictures]
@@ -118,7 +118,8 @@ class _Collector:
 def take_pictures(finished: FinishedRun, rows: Sequence[TrackRow], choice: Choice) -> Pictures:
     """Read the chosen frames again and make the pictures.
 
-    If the recording cannot be read, a track has only drawings of its mesh.
+    If the recording cannot be read, tracks get only drawings of their meshes, and there is no
+    strip. ``rows`` are the original rows of tracks.csv.
     """
     collector = _Collector(choice)
     advice = "run `shapecat annotate` with --recording PATH first"
@@ -162,7 +163,7 @@ def _strip_frame(labelled: LabelledFrame, image: FramePicture, seconds: float) -
 
 
 def _snapshot(labelled: LabelledFrame, frame: Frame | None, item: LabelledObject) -> Snapshot:
-    """Return the points and mesh of an object in the level frame, its support at z = 0."""
+    """Return the points and mesh of an object in the level frame, with its support at z = 0."""
     points = _points(frame, item)
     neurons, middle = item.gas.neurons, np.asarray([item.box.center])
     body = next(points for points in (points, neurons, middle) if len(points))

@@ -1,8 +1,8 @@
 """Serve reports to this machine only; corrections are written to tracks.csv as they are made.
 
 Every request needs the secret token in its path and a Host header that names this machine; an
-Origin header, if present, must be this server. A page from elsewhere cannot guess the token, and a
-foreign domain name that resolves to this machine (DNS rebinding) fails the check of the Host.
+Origin header, if present, must name this server. A page from elsewhere cannot guess the token, and
+a foreign domain name that resolves to this machine (DNS rebinding) fails the check of the Host.
 """
 
 import json
@@ -84,7 +84,7 @@ class _Site:
         return _Answer(HTTPStatus.NOT_FOUND, "no such page")
 
     def post(self, address: str, body: bytes) -> _Answer:
-        """Write a label to tracks.csv; return all labels, and the problem if it was rejected."""
+        """Write a label to tracks.csv; return all labels, and the reason if this one is refused."""
         report, name = self._find(address)
         if report is None or name != _LABELS:
             return _Answer(HTTPStatus.NOT_FOUND, "no such page")

@@ -46,7 +46,8 @@ class SurfaceDrawing(NamedTuple):
 def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[SurfaceDrawing, ...]:
     """Draw an object as the sensor sees it, from the side, and from above.
 
-    All three drawings have the same scale, from the sphere around the points and neurons.
+    All three drawings have the same scale, set by the sphere around the points and neurons. If the
+    snapshot has no points, points on its mesh are drawn instead.
     """
     points = np.asarray(shot.points[:: 1 + len(shot.points) // MOST_POINTS], np.float64)
     points = points if len(points) else np.asarray(_graph_points(shot.gas), np.float64)
@@ -84,7 +85,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[SurfaceDrawing, 
 
 
 def _graph_points(gas: NeuralGas) -> F4:
-    """Return points (n, 3), metres, on the triangles and edges of a mesh, to replace its cloud."""
+    """Return points (n, 3), metres, on the triangles and edges of a mesh."""
     corners = gas.neurons[triangles_of(gas.edges, len(gas.neurons))]
     weights = np.array([[a, b, 8 - a - b] for a in range(9) for b in range(9 - a)]) / 8
     faces = np.einsum("kc,tcd->tkd", weights, corners).reshape(-1, 3)

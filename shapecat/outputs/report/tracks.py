@@ -1,4 +1,4 @@
-"""The timeline of each track: when it was detected, and its posterior so far."""
+"""The timeline of each track: when it was detected, and its posterior over time."""
 
 from pathlib import Path
 
@@ -55,7 +55,7 @@ def read_timelines(folder: Path) -> dict[int, Timeline]:
 
 
 def read_stage_seconds(folder: Path) -> dict[str, F8]:
-    """Return the duration of each stage in the frames of a run, (frames,) seconds."""
+    """Return the seconds (frames,) that each stage took in the frames of a run."""
     seconds_by_stage: dict[str, list[float]] = {}
     for group in read_row_groups(folder / "frames.parquet", ["stages", "seconds"]):
         for row in group.to_pylist():
@@ -65,7 +65,7 @@ def read_stage_seconds(folder: Path) -> dict[str, F8]:
 
 
 def read_length(folder: Path) -> float:
-    """Return the log time from the first to the last frame of a run, seconds; 0 without frames."""
+    """Return the time between the first and last frame by log time, seconds; 0 without frames."""
     groups = read_row_groups(folder / "frames.parquet", ["log_time_ns"])
     times = [time for group in groups for time in group["log_time_ns"].to_pylist()]
     return (max(times) - min(times)) * 1e-9 if times else 0.0

@@ -32,7 +32,7 @@ PAGE, INDEX = "report.html", "index.html"
 _MANIFEST = "manifest.jsonl"
 """The file in which a batch records the state of each recording."""
 _MARK = b'<p class="kicker">shapecat report</p>'
-"""A part of index.html in each version."""
+"""Text by which an index.html that any version of shapecat made is recognized."""
 _FACES = 6
 _REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
 
@@ -41,9 +41,12 @@ _REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
 class RunReport:
     """The content of a run's page, except the labels, which are read when the page is made.
 
-    ``work`` is the id in run.json, ``stages`` holds the seconds (frames,) of each stage,
-    ``length_s`` is the time from the first to the last frame, seconds, and ``index`` is the link to
-    the index of several runs, None if there is none.
+    Attributes
+    ----------
+    work : ``work`` in run.json, by which a replaced run is noticed.
+    stages : (frames,) seconds of each stage.
+    length_s : time from the first to the last frame, seconds.
+    index : link to the index of several runs; None if there is none.
     """
 
     folder: Path
@@ -116,7 +119,7 @@ class RunReport:
 class Reports:
     """The reports of runs; ``indexed`` says whether there is an index in their common folder.
 
-    ``failed`` holds the reason for each run that has no report.
+    ``failed`` holds the error of each run that could not be read.
     """
 
     runs: Sequence[RunReport]
@@ -156,9 +159,9 @@ class Reports:
 
         Raises
         ------
-        OutputError : shapecat did not make the index that is there; then nothing is written. Or a
-            page cannot be written, a tracks.csv is invalid, or a run has been replaced; the other
-            pages are written.
+        OutputError : shapecat did not make the index that is there, and nothing is written; or a
+            page cannot be written, a tracks.csv is invalid, or a run has been replaced, and the
+            other pages are written.
         """
         pages: dict[Path, Callable[[], str]] = {r.folder / PAGE: r.page for r in self.runs}
         if self.indexed and self.runs:
@@ -181,6 +184,8 @@ class Reports:
 
 def read_reports(folders: Sequence[Path], observe: Observer = ignore) -> Reports:
     """Read the content of the report page of each run, and of their index.
+
+    Runs that cannot be read are listed in ``failed`` of the result.
 
     Parameters
     ----------

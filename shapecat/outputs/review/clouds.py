@@ -41,10 +41,10 @@ def paint(
 ) -> tuple[PaintedCloud, PaintedCloud]:
     """Return the points on no object and the points on objects, together about ``limit``.
 
-    Images are thinned on a grid of pixels, clouds by taking every k-th point; objects have a finer
-    grid, up to half of the points. Points on objects have the colour of the category, points on
-    planes a muted colour; all others are grey. Depth images are shaded as if lit from above the
-    camera. Points that a colour camera sees have their true colours, tinted on objects.
+    Depth images are thinned to a grid of pixels, clouds to every k-th point. Objects are thinned
+    less; they get up to half of the points. Points on objects have the colour of the category,
+    points on planes a muted colour, and all others are grey. Depth images are shaded as if lit from
+    above the camera. Points that a colour camera sees have their true colours, tinted on objects.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def paint(
 def _shaded(
     frame: Frame, pixels: I4, points: F4, tones: U2, palette: U1, planes: Sequence[Plane]
 ) -> U4:
-    """Return the colours (n,) of points, 0xRRGGBBAA, from the palette or by plane, shaded."""
+    """Return the colours (n,) of points, 0xRRGGBBAA, by object or plane, and shaded."""
     light = np.ones(pixels.size, np.float32)
     if frame.depth is not None and frame.camera is not None:
         light = _light(frame.depth, pixels, frame.camera.fx, frame.camera.fy)

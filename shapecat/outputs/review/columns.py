@@ -1,7 +1,7 @@
-"""Rows of the review's entities over time, held back and sent as columns.
+"""Collect the rows of the review's entities over time, and write them as columns.
 
 A call for each row costs ten times as much, and Rerun keeps a record of each chunk. So an entity is
-written when enough rows, or enough numbers, are held back.
+written when its buffer holds enough rows, or enough numbers.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -19,11 +19,11 @@ At = tuple[int, int]
 _ROWS = 256
 """An entity is written when it holds this many rows."""
 _NUMBERS = 1 << 17
-"""It is written earlier if its rows hold this many numbers."""
+"""An entity is written earlier if its rows hold this many numbers."""
 
 
 class Drawing(NamedTuple):
-    """Drawing function (from rows to columns) and static style of an entity."""
+    """How an entity is drawn: the function that turns rows into columns, and a static style."""
 
     columns: Callable[[Sequence[Any]], Iterable[rr.ComponentColumn]]
     style: rr.AsComponents | None = None

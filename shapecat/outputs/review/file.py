@@ -22,7 +22,7 @@ _PATIENCE_S = 60.0
 
 
 class ReviewFile:
-    """Copies Rerun's output from a pipe to a file, in a thread; after an error, discards it."""
+    """A thread that copies Rerun's output from a pipe to a file; after an error, it discards it."""
 
     def __init__(self, stream: rr.RecordingStream, file: IO[bytes]) -> None:
         """Connect ``stream`` to ``file``."""
@@ -90,6 +90,6 @@ def forget_reviews() -> None:
     Active recordings of the program that calls shapecat stay active.
     """
     shared, own = rr.get_global_data_recording(), rr.get_thread_local_data_recording()
-    rr.init("shapecat", init_logging=False)  # makes no recording, and ends those without reference
+    rr.init("shapecat", init_logging=False)  # makes no recording, but ends unreferenced ones
     rr.set_global_data_recording(shared)
     rr.set_thread_local_data_recording(own)

@@ -23,7 +23,7 @@ _MOST_TRACKS = 48  # views, for the longest tracks; the recording holds all trac
 
 @dataclass(frozen=True)
 class Eye:
-    """The eye of a 3D view: position, target and up direction (3,), metres, in its frame."""
+    """The eye of a 3D view: position, target and up direction (3,), metres, in the view's frame."""
 
     position: F8
     target: F8
@@ -32,7 +32,7 @@ class Eye:
 
 @dataclass
 class TrackView:
-    """A track for the layout; ``frames`` is the number of frames that show it."""
+    """A track to plot; ``frames`` is the number of frames that show it."""
 
     entity: str
     title: str
@@ -40,7 +40,7 @@ class TrackView:
 
 
 class _Layout(rrb.Blueprint):  # type: ignore[misc]  # Rerun is untyped
-    """A blueprint that keeps the stream to which Rerun writes it, to be closed afterwards."""
+    """A blueprint that keeps the stream to which Rerun writes it, so that it can be closed."""
 
     stream: rr.RecordingStream | None = None
 
@@ -68,9 +68,9 @@ def choose_eye(labelled: LabelledFrame, frame: Frame, *, fixed: bool) -> Eye:
 
 
 def stepped_back(eye: Eye, low: F8, high: F8) -> Eye:
-    """Move the eye back until the box between two corners (3,), metres, is in view.
+    """Aim an eye at the box between two corners (3,), metres, and move it back to see the box.
 
-    The eye stays where it is if the box is too large.
+    If the box is too large, the eye is returned unchanged.
     """
     radius = float(np.linalg.norm(high - low) / 2) + 0.1
     if not radius <= _WIDEST_M:
@@ -82,14 +82,17 @@ def stepped_back(eye: Eye, low: F8, high: F8) -> Eye:
 
 
 def _up(labelled: LabelledFrame, frame: Frame) -> F8:
-    """Return the up direction (3,) of a frame, or a likely one if no plane confirms it."""
+    """Return the up direction (3,) of a frame; for a cloud without planes, the z axis."""
     if labelled.planes or frame.organized:
         return np.asarray(labelled.up, np.float64)
-    return np.array([0.0, 0.0, 1.0])  # of a lidar, not of a camera as detection assumes
+    return np.array([0.0, 0.0, 1.0])  # as of a lidar; detection assumes a camera
 
 
 def _subject(labelled: LabelledFrame, frame: Frame, pose: Pose) -> tuple[F8, float]:
-    """Return centre (3,) and radius, metres, of the objects, or else the planes or points."""
+    """Return centre (3,) and radius, metres, of the objects, or else of the planes or points.
+
+    ``pose`` transforms the centre.
+    """
     if labelled.objects:
         half = [np.full(3, o.box.size.max() / 2) for o in labelled.objects]
         centers = np.array([o.box.center for o in labelled.objects])

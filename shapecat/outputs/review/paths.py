@@ -51,8 +51,8 @@ class Paths:
     ) -> None:
         """Add the category and position of each track in a frame; remove tracks that have ended.
 
-        A track seen by two sensors has a path in each one's entity; if it has ended, all are
-        removed.
+        A track that several sensors see has a path in the entity of each; when it ends, all its
+        paths are removed.
         """
         gone, entity_paths = set(ended), self._paths.setdefault(entity, {})
         changed = set()

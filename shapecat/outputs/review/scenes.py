@@ -61,7 +61,7 @@ def choose_scenes(
     Parameters
     ----------
     fixed : whether motion is measured in the fixed frame, where a moving camera does not count.
-    placed : topics whose scenes are drawn only at a known place in the fixed frame.
+    placed : topics whose scenes are drawn only if the pose in the fixed frame is known.
     """
     last: dict[str, LabelledFrame] = {}  # last drawn frame of each topic
     for labelled in frames:

@@ -1,6 +1,6 @@
 """Convert records to Rerun archetypes for the review.
 
-Several frames are converted at a time, to columns: a call for each costs ten times as much.
+Several frames are converted to columns at a time: a call for each frame costs ten times as much.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -52,7 +52,7 @@ _Way = tuple[str, F8]
 
 
 class DrawnScene(NamedTuple):
-    """A frame to draw with its points: those on no object, and those on objects."""
+    """A frame to draw; ``scene`` holds the points on no object, ``points`` those on objects."""
 
     labelled: LabelledFrame
     scene: PaintedCloud
@@ -60,7 +60,7 @@ class DrawnScene(NamedTuple):
 
     @property
     def size(self) -> int:
-        """The number of points, and of pixels that objects list."""
+        """The number of points plus the number of pixels in the ``indices`` of the objects."""
         pixels = sum(o.indices.size for o in self.labelled.objects)
         return len(self.scene.points) + len(self.points.points) + pixels
 
@@ -193,7 +193,7 @@ def _fan(corners: int) -> U4:
 
 
 def _mesh(parts: Sequence[tuple[int, U4]]) -> U4:
-    """Return the triangles of a mesh made of parts, given as vertex count and triangles."""
+    """Join parts, each a number of vertices and triangles (n, 3), to the triangles of one mesh."""
     starts = np.cumsum([0, *(vertices for vertices, _ in parts)])
     faces = [triangles + start for (_, triangles), start in zip(parts, starts, strict=False)]
     return np.concatenate(faces).astype(np.uint32) if faces else np.zeros((0, 3), np.uint32)

@@ -11,8 +11,8 @@ Entities
     │   └── objects
     │       ├── boxes          labelled "#track category confidence"
     │       └── captions       shorter, drawn above the boxes
-    └── seen/<topic>           the scene, up to eleven times a second if it changes, with the sensor
-        ├── scene              pose of its frame (below <topic> without a fixed frame)
+    └── seen/<topic>           pose of the sensor when the scene below was drawn
+        ├── scene              points on no object
         ├── planes             outlines;  planes/fill  translucent
         └── objects
             ├── points         in the colour of the category
@@ -29,7 +29,8 @@ Entities
     log                        starts and ends of tracks, warnings of the run
     run                        run.json as text
 
-Timelines: ``sensor_time`` (the stamp) and ``frame``.
+A scene is drawn up to eleven times a second, if it changes. Without a fixed frame, it is below
+``world/<topic>``. Timelines: ``sensor_time`` (the stamp) and ``frame``.
 """
 
 import json
@@ -113,9 +114,9 @@ def write_review(
 
 
 def _stream(name: str, run: RunInfo, labels: Mapping[int, TrackLabel]) -> rr.RecordingStream:
-    """Return a stream whose content depends only on what is logged.
+    """Return a stream without log times, whose ids are hashes of the arguments.
 
-    A viewer joins files of the same recording, and has one layout for each application.
+    A viewer merges files with the same recording id, and has one layout per application id.
     """
     content = json.dumps([name, run, sorted(labels.items())], sort_keys=True, default=str)
     identity = uuid.uuid5(uuid.NAMESPACE_OID, content)
@@ -227,7 +228,7 @@ class _Review:
             self._columns.add(f"{entity}/{name}", at, scene, drawing, size=scene.size)
 
     def _place_sensor(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
-        """Write the axes and the frustum of the sensor if they are new."""
+        """Choose the eye, and write the axes and the frustum of the sensor, if they are new."""
         topic = labelled.topic
         if topic not in self._eyes or (labelled.objects and topic not in self._aimed):
             self._eyes[topic] = choose_eye(labelled, frame, fixed=self._fixed_frame is not None)
