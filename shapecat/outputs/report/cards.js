@@ -1,4 +1,4 @@
-// The gallery: what cards show, which are shown, in which order; and the table of corrections.
+// The gallery of cards: their content, filter and order. Also the table of corrections.
 const gallery = byId("gallery");
 const cards = [...gallery.querySelectorAll(".card")];
 const byTrack = new Map(cards.map((card) => [card.dataset.track, card]));
@@ -29,13 +29,13 @@ function showCard(card) {
   if (document.activeElement !== other) restore(other);
 }
 
-// Show the label again in a text field, instead of what was typed.
+// Replace the typed text in a text field by the label.
 function restore(other) {
   other.value = other.defaultValue;
   other.setCustomValidity("");
 }
 
-// Take the label that was typed; return whether it is valid.
+// Give the track the label that was typed into its text field; return whether it is valid.
 function take(other) {
   if (other.value !== other.defaultValue) {
     const label = known(other.value.normalize("NFC").trim().replace(/\s+/g, " "));
@@ -65,7 +65,7 @@ function filter() {
   }
   byId("shown").textContent = `${count} of ${cards.length} ${cards.length === 1 ? "track" : "tracks"}`;
   byId("empty").hidden = count > 0;
-  // Keys act on the current card, which must be in sight.
+  // Keys act on the current card, which must not be hidden.
   if (!current || current.hidden) makeCurrent([...gallery.children].find((card) => !card.hidden));
 }
 
@@ -118,7 +118,7 @@ function confusion(checked) {
 
 function csv() {
   const quote = (cell) => (/[",\r\n]/.test(cell) ? `"${cell.replaceAll('"', '""')}"` : cell);
-  // Add the labels that it replaces, so that it does not undo labels given elsewhere since.
+  // Add the labels that this table replaces, so that it cannot undo labels that were given elsewhere since.
   const lines = data.rows.map((row) => [...data.columns.map((name, k) =>
     quote(name === "label" ? labels.get(row.track) : row.cells[k])), quote(replaced(row.track))].join(","));
   const text = [[...data.columns, "label_seen"].map(quote).join(","), ...lines, ""].join("\n");
@@ -153,7 +153,7 @@ byId("meshes").addEventListener("change", (event) =>
 byId("download").addEventListener("click", () => {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(new Blob([csv()], { type: "text/csv" }));
-  // A name of its own: the browser would rename a second tracks.csv, and the command read the first.
+  // Each download has its own name: the browser would rename a second tracks.csv, and the command would read the first.
   link.download = `tracks-${new Date().toLocaleString("sv").replace(/\D/g, "")}.csv`;
   const command = byId("command");
   command.textContent = `${command.dataset.annotate} --labels ~/Downloads/${link.download}`;

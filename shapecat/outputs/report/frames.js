@@ -1,4 +1,4 @@
-// The strip of frames: boxes with the labels of the tracks, and a frame shown large.
+// The strip of frames, with the boxes and labels of tracks, and the enlarged frame.
 const frames = [...document.querySelectorAll(".frame")];
 const large = byId("large");
 let open = 0;
@@ -14,7 +14,7 @@ function showBoxes(track) {
   }
 }
 
-// Labels that would cover each other move down by their height.
+// Move labels that would cover each other down by their height.
 function spread(shot) {
   const placed = [];
   const captions = [...shot.querySelectorAll(".box b")];
@@ -41,7 +41,7 @@ function openFrame(number, track) {
   spread(shot);
 }
 
-// The frame of the strip in which a track has the largest box.
+// Return the index of the frame in which a track has the largest box; -1 if no frame shows it.
 function frameOf(track) {
   const sizes = frames.map((frame) => {
     const box = frame.querySelector(`.box[data-track="${track}"]`);

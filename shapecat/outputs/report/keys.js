@@ -1,4 +1,4 @@
-// The keyboard: one card is the current one; keys act on it.
+// The keyboard: keys act on the current card.
 let current = null;
 
 function makeCurrent(card) {

@@ -1,16 +1,16 @@
-// The labels of the tracks as this page has them, and how to undo the last.
+// The labels of the tracks on this page, and the undo of the last one.
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
 const labels = new Map(data.rows.map((row) => [row.track, row.label]));
 const past = [];
 
-// A label as this page spells it: `Delete` and `CUP` mean `delete` and `cup`.
+// Return a label in its usual spelling: `Delete` and `CUP` become `delete` and `cup`.
 function known(label) {
   const found = ["delete", ...data.categories].find((name) => name.toLowerCase() === label.toLowerCase());
   return found === undefined ? label : found;
 }
 
-// What a label says: the category itself, even for `new pan`.
+// Return the label of a track in its usual spelling, and without `new`: `pan` for `new pan`.
 function labelOf(track) { return known(labels.get(track).replace(NEW, "$1")); }
 
 function say(text, bad = false) {
@@ -28,7 +28,7 @@ function learn(label) {
   showDigits();
 }
 
-// Give a track a label, unless that is invalid; return the problem.
+// Give a track a label; if the label is invalid, change nothing and return the problem.
 function setLabel(track, label) {
   const before = labels.get(track);
   if (before === label) return "";

@@ -1,9 +1,9 @@
-// Which labels are valid, by the rules of runs/labels/meaning.py: `annotate` refuses a table with one that is not.
+// Check labels by the rules of runs/labels/meaning.py, since `annotate` refuses a table with an invalid label.
 const MERGE = /^merged? +(?:with|into) +#?0*(\d{1,9})(?:[.,]0*)?$/i;
 const NEW = /^new +(.+)$/i;
 const NAME = /^(?!\p{Nd})[\p{L}\p{N}](?:[\p{L}\p{N}_ .+&'()-]{0,58}[\p{L}\p{N}_)])?$/u;
 
-// Why a track cannot have a label: it, or then that of another track, would be invalid.
+// Return the problem if a label would be invalid for a track, or would make the label of another track invalid.
 function problem(track, label) {
   const before = problems(labels), after = problems(new Map(labels).set(track, label));
   if (after.has(track)) return after.get(track);
@@ -11,7 +11,7 @@ function problem(track, label) {
   return "";
 }
 
-// The problem of each invalid label, by track.
+// Return the problem of each invalid label, by track.
 function problems(given) {
   const names = new Set([...data.known, ...data.rows.map((row) => row.category)].map((name) => name.toLowerCase()));
   const found = new Map();
@@ -23,7 +23,7 @@ function problems(given) {
   return found;
 }
 
-// Why a label has no meaning. If it is a new category, it is added to the known names.
+// Return the problem of a label without a meaning. Add a new category to the known names.
 function misread(label, names) {
   const lower = label.toLowerCase();
   if (!label || lower === "delete" || names.has(lower) || MERGE.test(label)) return "";
@@ -41,7 +41,7 @@ function misread(label, names) {
   return "";
 }
 
-// Why a track cannot be merged as its label says.
+// Return the problem if a track cannot be merged as its label says.
 function misled(track, given) {
   const chain = [track];
   for (let merge; (merge = given.get(chain.at(-1)).match(MERGE)); chain.push(merge[1])) {
@@ -59,7 +59,7 @@ function topics(track) {
   return (cells[data.columns.indexOf("topic")] || "").trim().split(/\s+/);
 }
 
-// The edit distance: letters added, dropped, changed or swapped.
+// Return the edit distance: the number of letters added, dropped, changed or swapped.
 function slips(a, b) {
   let before, last = [...Array(b.length + 1).keys()];
   for (let i = 1; i <= a.length; i++) {

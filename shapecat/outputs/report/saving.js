@@ -1,7 +1,7 @@
-// Where labels go: to tracks.csv by the server, or into this browser until they are downloaded.
+// Save labels: the server writes them to tracks.csv, or this browser keeps them until they are downloaded.
 const storage = `shapecat:${data.key}`;
 const onDisk = new Map(labels);
-const given = new Map();  // corrections in downloaded tables: they may be in tracks.csv by now
+const given = new Map();  // corrections in downloaded tables, which may be in tracks.csv by now
 const sending = new Set();
 let lost = "", before = Promise.resolve();
 
@@ -9,16 +9,16 @@ function save(track) {
   if (data.served) send(track); else keep(track);
 }
 
-// Keep a correction with the label that it replaces, besides those of other tabs.
+// Store a correction, and the label that it replaces, beside the corrections of other tabs.
 function keep(track) {
   try {
     const all = kept(), [label, seen] = [labels.get(track), onDisk.get(track)];
     if (label === seen && !given.has(track)) delete all[track]; else all[track] = [label, seen, given.get(track)];
     localStorage.setItem(storage, JSON.stringify(all));
-  } catch { /* a browser that keeps nothing for files still downloads */ }
+  } catch { /* Some browsers store nothing for local files; the download still works. */ }
 }
 
-// The corrections that were not downloaded, except of labels that have changed since.
+// Return the stored corrections, without those of labels that have changed on disk since.
 function kept() {
   const all = Object.entries(JSON.parse(localStorage.getItem(storage) || "{}"));
   return Object.fromEntries(all.filter(([track, [, seen]]) => onDisk.get(track) === seen));
@@ -31,14 +31,14 @@ function recall() {
       if (typeof told === "string") given.set(track, told);
       learn(label);
     }
-  } catch { /* the same */ }
+  } catch { /* The browser stores nothing for local files. */ }
 }
 
 function unsaved() {
   return data.rows.map((row) => row.track).filter((track) => labels.get(track) !== onDisk.get(track));
 }
 
-// The label that a downloaded table replaces.
+// Return the label that a downloaded table replaces.
 function replaced(track) {
   const seen = onDisk.get(track);
   return labels.get(track) === seen && given.has(track) ? given.get(track) : seen;
@@ -51,7 +51,7 @@ function noteDownload() {
   }
 }
 
-// Take over what other tabs and programs wrote, where this page has nothing newer.
+// Take over the labels that other tabs and programs wrote, unless this page has a newer one.
 function adopt(disk) {
   for (const [track, label] of Object.entries(disk)) {
     if (!labels.has(track) || onDisk.get(track) === label) continue;
@@ -74,8 +74,8 @@ async function request(options) {
   return [reply.ok, await reply.json()];
 }
 
-// Send the newest label of a track until the disk has it; the server refuses it if the label there
-// is not the one this page knows.
+// Send the newest label of a track until it is in tracks.csv. The server refuses it if the label in
+// tracks.csv is not the one that this page knows.
 async function send(track) {
   if (sending.has(track)) return;
   sending.add(track);
@@ -117,7 +117,7 @@ function showSaved() {
   }
 }
 
-// The server answers again: send what it did not get.
+// Send the labels that the server did not get, now that it answers again.
 function sendAgain() {
   lost = "";
   for (const track of unsaved()) send(track);
