@@ -13,7 +13,7 @@ from shapecat.types import Camera
 __all__ = ["FISHEYE_MODELS", "LENS_MODELS", "distort", "undistorted_rays"]
 
 FISHEYE_MODELS = ("equidistant", "fisheye", "kannala_brandt")
-"""Names of Kannala and Brandt's model, the last one in Foxglove's messages."""
+"""Names of Kannala and Brandt's model; Foxglove's messages use the last one."""
 LENS_MODELS = ("plumb_bob", "rational_polynomial", *FISHEYE_MODELS)
 """The supported lens models of OpenCV's calibration."""
 

@@ -58,7 +58,7 @@ def mask_of(masks: ImageMasks, detections: Sequence[int]) -> Mask:
 def box_of(masks: ImageMasks, detections: Sequence[int]) -> tuple[int, int, int, int] | None:
     """Return left, top, width and height, in pixels, of the box around some detections' masks.
 
-    None if no detection has a mask; ``detections`` as in `mask_of`.
+    The result is None if no detection has a mask. ``detections`` are numbers in the frame, from 0.
     """
     boxes = [masks.boxes[number] for number in detections if number in masks.boxes]
     if not boxes:

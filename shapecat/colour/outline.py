@@ -11,7 +11,7 @@ from shapecat.jit import kernel
 __all__ = ["joined", "outlines"]
 
 _TOLERANCE_PX = 0.75
-"""Corners that stick out by fewer pixels are dropped; steps of a slanted edge do so by 0.71."""
+"""Corners that stick out by less are dropped; the steps of a slanted edge stick out by 0.71."""
 
 
 def outlines(mask: Mask) -> list[F8]:

@@ -161,7 +161,8 @@ def _compare(colours: U1, depth: F4, band: float, core: float, window: int, log_
 def _negative_log_likelihood(colour: U1, total: F4, squares: float, count: int) -> float:
     """Return the negative log-likelihood of a colour (channels,), up to a constant.
 
-    ``total`` (channels,) is the sum of ``count`` sampled colours, ``squares`` that of all squares.
+    ``total`` (channels,) is the sum of ``count`` sampled colours, ``squares`` the sum of their
+    squares over all channels.
     """
     apart, of_means = 0.0, 0.0
     for k in range(colour.size):

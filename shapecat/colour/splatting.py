@@ -64,10 +64,10 @@ def splat_depth(
 
 
 def _rays(camera: Camera, colour_from_depth: Pose) -> tuple[F4, F4, F4]:
-    """Return the rays of depth pixels in the colour camera's frame, in two parts, and its offset.
+    """Return the rays of depth pixels in the colour camera's frame, and their common origin.
 
     The ray of pixel (u, v) is column u of the first array (3, w) plus column v of the second one
-    (3, h). The third array (3,) is the translation of ``colour_from_depth``, metres.
+    (3, h). The third array (3,) is the origin: the translation of ``colour_from_depth``, metres.
     """
     x = (np.arange(camera.width) - camera.cx) / camera.fx
     y = (np.arange(camera.height) - camera.cy) / camera.fy

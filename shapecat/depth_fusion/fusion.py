@@ -76,7 +76,7 @@ def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
 
 
 def drop_missing_depth(scene: Scene, frame: Frame) -> Scene:
-    """Remove from the candidates of a scene the pixels where the frame itself has no depth."""
+    """Remove from the candidates of a scene the pixels where the frame, unfused, has no depth."""
     if frame.depth is None:
         return scene
     measured = frame.depth.reshape(-1) > 0
@@ -192,7 +192,7 @@ def _add_moved(expected: F4, earlier: F4, homography: F4, shift: F4, total: F4, 
 
 @kernel(inner=True)
 def _project_row(depths: F4, v: int, homography: F4, shift: F4, x: F4, y: F4, z: F4) -> None:
-    """Write column x, row y and depth z, in the earlier image, of the points of row ``v``."""
+    """Write column x, row y and depth z, in the earlier image, of the pixels in row ``v``."""
     min_depth = np.float32(NEAREST_M)
     row = np.float32(v)
     a, b = homography[0, 1] * row + homography[0, 2], homography[1, 1] * row + homography[1, 2]

@@ -9,11 +9,11 @@ from shapecat.types import Frame, Pose
 __all__ = ["Earlier", "RecentFrames"]
 
 GAP_NS = 500_000_000
-"""Longest time between two frames that are fused."""
+"""Longest time between consecutive frames that are fused."""
 
 
 class Earlier(NamedTuple):
-    """An earlier frame, and the pose of the current sensor in its sensor frame.
+    """An earlier frame, and the pose of the current sensor in the sensor frame of that frame.
 
     The pose is None if it is not known; the sensor is then assumed not to have moved.
     """
