@@ -22,14 +22,14 @@ _AHEAD = 4
 
 @dataclass(frozen=True)
 class Coloured:
-    """The colour image of a frame, and the masks of its objects, in the same order."""
+    """The colour image of a frame, and a mask for each of its objects, in their order."""
 
     view: ColourView
     masks: tuple[Mask, ...]
 
 
 ExportedFrame = tuple[LabelledFrame, Frame, Coloured | None]
-"""A labelled frame with its depth, and its colour image if it has one."""
+"""A labelled frame, its depth image or cloud, and its colour image if it has one."""
 
 
 def with_colour(
@@ -45,7 +45,7 @@ def with_colour(
 
     Yields
     ------
-    Labelled frame, frame, and colour image with masks; None without a colour image.
+    The labelled frame, its frame in the recording, and its colour image with masks, or None.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def with_colour(
 
 
 class _Awaited:
-    """The requested frames; a few are read in advance, to know which messages they need."""
+    """The requested frames; a few are read in advance, to know which messages are needed."""
 
     def __init__(self, frames: Iterable[LabelledFrame], run: RunInfo) -> None:
         self._topics, self._colours = set(run["options"]["topics"]), {*run["color"].values()}
@@ -88,8 +88,8 @@ class _Awaited:
     def needs(self, topic: str, log_time_ns: int) -> bool:
         """Return whether a depth or colour message belongs, or may belong, to an awaited frame.
 
-        Only the next few awaited frames are known. A message that is not earlier than all of these
-        may belong to a frame after them. Messages of other topics are always needed.
+        Only the next few awaited frames are known. A message at the time of the last of these, or
+        later, may belong to a frame after them. Messages of other topics are always needed.
         """
         if topic not in self._topics | self._colours:
             return True
@@ -104,7 +104,7 @@ class _Awaited:
 
         Parameters
         ----------
-        topic, number : the frame's; it is one of the next few awaited frames.
+        topic, number : of the frame, which is among the next few awaited frames.
         """
         named = (one for one in self._next if (one.topic, one.index) == (topic, number))
         masks = next((one.masks for one in named), None)

@@ -18,7 +18,7 @@ def plural(count: int, noun: str) -> str:
 
 
 def by_count(counts: Mapping[str, int]) -> list[tuple[str, int]]:
-    """Return names and counts, largest count first, and by name where counts are equal.
+    """Return names and counts, sorted by descending count, then by name.
 
     Examples
     --------

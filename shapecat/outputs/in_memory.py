@@ -19,7 +19,7 @@ from shapecat.types import Camera, Detection, Frame, LabelledFrame, LabelledObje
 __all__ = ["frame_of", "perceive_alone"]
 
 _FARTHEST_M = 100.0
-"""Values with a larger median of depths, or of largest coordinates, are not in metres."""
+"""If the median of depths, or of largest coordinates, is larger, the unit is not metres."""
 _FIXED = ([0, 1, 2, 2, 2], [1, 0, 0, 1, 2])
 """Rows and columns of the elements that are 0 or 1 in every camera matrix without skew."""
 _SHORTEST = 0.05
@@ -90,7 +90,7 @@ def _camera(intrinsics: ArrayLike | Camera, height: int, width: int) -> Camera:
 def perceive_alone(
     frame: Frame, *, up: Sequence[float] | None, categorizer: Categorizer, settings: Settings
 ) -> RunFrame:
-    """Return the objects of one frame with the labels of this view.
+    """Perceive one frame, and return its objects with labels from this view alone.
 
     Parameters
     ----------

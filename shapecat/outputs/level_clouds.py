@@ -1,4 +1,4 @@
-"""Clouds in the level frame, and PCD files of them."""
+"""Point clouds in the level frame, and PCD files."""
 
 from pathlib import Path
 
@@ -50,7 +50,7 @@ def upright_cloud(
 ) -> tuple[F4, Pose] | None:
     """Return the points (n, 3) of an object in the level frame, and the sensor's pose in it.
 
-    The support is at z = 0; metres. None if no point has depth.
+    Points are in metres, with the support at z = 0. The result is None if no point has depth.
     """
     points = finite_points(frame, item.indices)
     if not len(points):

@@ -141,7 +141,7 @@ class RunFrame:
         return image
 
     def mask(self, item: LabelledObject) -> Bool:
-        """Return which pixels or points belong to an object; bool, with shape `shape`."""
+        """Return the mask of an object's pixels or points; bool, with shape `shape`."""
         mask = np.zeros(self.shape, np.bool_)
         mask.reshape(-1)[item.indices] = True
         return mask

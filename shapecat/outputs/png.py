@@ -23,7 +23,7 @@ def png(
 
     Parameters
     ----------
-    image : (h, w) grey values, uint16 or uint8; with a palette, its uint8 indices.
+    image : (h, w) grey values, uint16 or uint8; with a palette, uint8 indices into it.
     palette : (k, 3) red, green, blue.
     alpha : (a,) opacity, from 0 to 255, of the first entries of the palette.
     level : compression from 1 (fast, for images with long runs, such as masks) to 9 (small).

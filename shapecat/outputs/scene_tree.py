@@ -1,4 +1,4 @@
-"""A tree of text: what stands on what in a frame, from the tables of a run."""
+"""A text tree of the planes and objects in a frame, from the tables of a run."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -26,7 +26,7 @@ _CANDIDATE_COLUMNS = (
     "touches_border",
     "occluded",
 )
-"""Columns of `detections.parquet` that make a candidate."""
+"""Columns of detections.parquet from which a candidate is made."""
 
 
 def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str:
@@ -73,7 +73,7 @@ def _read_scene(folder: Path, labelled: LabelledFrame) -> Scene:
 
 
 def _are_supported(below: Sequence[int | None]) -> bool:
-    """Return whether each stack of objects has a lowest one, which stands on no object.
+    """Return False if an object stands, directly or through others, on itself or a missing one.
 
     ``below`` holds, for each object, the index of the object directly below it, or None.
     """
@@ -157,7 +157,7 @@ def _apply_labels(
     index = {part: k for k, n in enumerate(shown) for part in parts[n]}
 
     def bottom(n: int) -> float:
-        """Return the height of the lower end of a candidate along up, metres."""
+        """Return the height of the bottom of a candidate's box along up, metres."""
         box = scene.candidates[n].box
         return float(scene.up @ box.center - box.size[2] / 2)
 

@@ -11,7 +11,7 @@ __all__ = ["caption", "confidence_text", "different_names", "safe_name", "time_s
 
 _SAFE = re.compile(r"[\w .+&'()-]")
 _LONGEST_BYTES = 120
-"""Longest safe name; file systems allow 255 bytes, but callers add to the name."""
+"""Longest safe name, bytes; file systems allow 255, but callers add prefixes and suffixes."""
 
 
 def caption(track: int, category: str, confidence: float) -> str:

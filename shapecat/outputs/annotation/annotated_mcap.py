@@ -34,9 +34,9 @@ from shapecat.types import AnnotationFrame
 __all__ = ["write_annotated"]
 
 _LIFETIME = 1.5
-"""Lifetime of scene entities, as a multiple of the frame period."""
+"""Lifetime of boxes in viewers, as a multiple of the frame period."""
 _BUFFER = 4 << 20
-"""Bytes written at a time; many, since two threads that write to one file wait for each other."""
+"""Size of the write buffer, bytes; large, since two threads that write to one file alternate."""
 _PERIOD_NS = 1_000_000_000
 """Frame period assumed for a stream with a single frame."""
 _LONGEST_NS = 3600 * 10**9
@@ -66,7 +66,7 @@ def write_annotated(
     Parameters
     ----------
     frames : the boxes to show in each frame, in the order of the recording.
-    markers : whether to write ``/shapecat/markers`` for RViz, for ROS only.
+    markers : whether to write ``/shapecat/markers`` for RViz, if the encoding is one of ROS.
     images : the boxes to show on the colour images, in the order of the recording. They are
         written to ``/shapecat/image_annotations`` and, for ROS, ``/shapecat/detections_2d``, with
         the stamp, frame id and log time of the image.
@@ -200,7 +200,7 @@ def _period(frame: AnnotationFrame, following: AnnotationFrame) -> int:
 
 
 def _encoding(recording: Recording, first: Annotation | None) -> str:
-    """Return the encoding of the annotated topic, or else the most common one, for annotations."""
+    """Return the encoding for annotations: the annotated topic's, or else the most common one."""
     if recording.kind == "ros1":
         return "cdr"
     topics = [topic for topic in recording.topics if topic.encoding in ENCODINGS]

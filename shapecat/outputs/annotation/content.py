@@ -28,7 +28,7 @@ class AnnotationChannel(NamedTuple):
 
 
 class Annotation(NamedTuple):
-    """A frame to write, how long viewers show its boxes, and the tracks whose boxes it removes."""
+    """A frame to write, the lifetime of its boxes, and the tracks whose boxes it removes."""
 
     frame: AnnotationFrame
     lifetime_ns: int

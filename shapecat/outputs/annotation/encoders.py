@@ -40,7 +40,7 @@ _INCOMPLETE = (
 )
 """ROS types of which only some fields are set; the others are zero.
 
-Only messages of these types start as zeros, since that takes time.
+Only messages of these types are filled with zeros first, since that takes time.
 """
 
 
@@ -111,7 +111,7 @@ def _protobuf() -> _Encoding:
 
 
 def _plain(*time_fields: str) -> Types:
-    """Return types whose messages are dictionaries; ``time_fields`` name seconds, nanoseconds."""
+    """Return types whose messages are dictionaries; ``time_fields`` are the fields of a time."""
 
     def time(time_ns: int) -> dict[str, int]:
         return dict(zip(time_fields, divmod(time_ns, 10**9), strict=True))
@@ -153,7 +153,10 @@ ENCODINGS: dict[str, Callable[[], _Encoding]] = {
     "json": _json,
     "protobuf": _protobuf,
 }
-"""Annotations have the encoding of the recording: a file with mixed encodings breaks ROS tools."""
+"""A function that makes each encoding, by its name.
+
+Annotations have the encoding of the recording: ROS tools fail on a file with mixed encodings.
+"""
 
 
 def _file(name: str, suffix: str) -> bytes:

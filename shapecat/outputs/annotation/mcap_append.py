@@ -1,4 +1,4 @@
-"""Append annotations to a copy of an MCAP file, whose data section stays unchanged."""
+"""Append annotations to a copy of an MCAP file, without changing its data section."""
 
 import errno
 import os
@@ -29,9 +29,9 @@ _CHUNK_BYTES = 256 << 10
 """Size of the chunks; small, since a reader that sorts messages by time keeps one in memory."""
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")
-"""A record's opcode and length; a message's channel, sequence, log time and publish time."""
+"""Opcode and length of a record; then channel, sequence, log time and publish time of a message."""
 _INDEX = struct.Struct("<BQHI")
-"""The head of a message index record: opcode, length, channel, and bytes of the entries."""
+"""The head of a message index record: opcode, length, channel, and size of the entries in bytes."""
 _COMPRESS = {"zstd": partial(zstandard.compress, level=1), "lz4": lz4.frame.compress}
 _WAITING = 8
 """Largest number of filled chunks in memory."""
@@ -176,7 +176,7 @@ class Appender:
         self._metadata.append(records.MetadataIndex(offset=offset, length=length, name=name))
 
     def finish(self) -> None:
-        """Complete the file: write the footer, and a summary of all that the file now holds."""
+        """Complete the file: write a summary of its whole content, and the footer."""
         self._flush(0)
         self._write([records.DataEnd(0)])
         start = self._file.tell()
@@ -223,7 +223,7 @@ class Appender:
         )
 
     def _flush(self, waiting: int) -> None:
-        """Submit the chunk if it has messages; wait until at most ``waiting`` chunks are left."""
+        """Submit the chunk unless it is empty; wait until at most ``waiting`` are unwritten."""
         if self._chunk.entries:
             self._waiting.append(self._writer.submit(self._write_chunk, self._chunk))
             self._chunk = _Chunk()

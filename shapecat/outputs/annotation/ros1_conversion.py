@@ -1,4 +1,4 @@
-"""Convert ROS 1 messages to ROS 2: the fields stay, only their encoding changes."""
+"""Convert ROS 1 channels and their messages to ROS 2."""
 
 import re
 from collections.abc import Callable

@@ -1,1 +1,1 @@
-"""Labels in the formats of other tools."""
+"""Exports of labels in the formats of other tools."""

@@ -17,7 +17,7 @@ from shapecat.runs.finished import FinishedRun
 __all__ = ["DATASETS", "write_coco", "write_yolo"]
 
 Images = Iterable[tuple[str, FinishedRun, DatasetImage]]
-"""Split, run and image."""
+"""Images, each with its split (``train`` or ``val``) and its run."""
 
 
 def write_coco(out: Path, images: Images, categories: Sequence[str]) -> int:

@@ -1,7 +1,7 @@
 """Crops: each view of each object as a point cloud, in the folder layout of data sets.
 
-``DATASET/<category>/<instance>/<view>.pcd``: metres, z up, the support at z = 0; VIEWPOINT is the
-pose of the sensor.
+The files are ``DATASET/<category>/<instance>/<view>.pcd``, in metres, with z up and the support at
+z = 0. VIEWPOINT is the pose of the sensor.
 """
 
 import math
@@ -25,7 +25,7 @@ _INSTANCE = re.compile(r".*\.([0-9a-f]{12})(?:\.([\d.]+)-([\d.]+|inf))?\.track-\
 
 
 class Origin(NamedTuple):
-    """Source and time range of the views of a run; the name of the run does not matter.
+    """Source and time range of the views of a run, independent of the name of the run.
 
     ``source`` is a digest of the recording and the topics; ``start_s`` and ``end_s`` bound the time
     range, seconds.

@@ -45,8 +45,8 @@ class Selection:
     Attributes
     ----------
     every : take every n-th frame of a stream.
-    per_track : take only frames with chosen views: of each track, at most so many, which differ as
-        much as possible. 0 takes all frames.
+    per_track : largest number of views to choose per track, as different as possible; only frames
+        with a chosen view are taken. 0 takes all frames.
     min_confidence : objects with a lower confidence are not used for training.
     corrected_only : whether only objects with a label from a person are used for training.
     depth : whether the images are depth images in millimetres instead of colour images.
@@ -87,7 +87,7 @@ class DatasetObject(NamedTuple):
 def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
     """Return ``train`` or ``val`` for each run; runs of the same recording are in the same split.
 
-    Hashes of the recordings' content replace random numbers, so that further runs change few
+    Recordings are drawn in the order of hashes of their content, so that further runs change few
     splits. A single recording goes to the training split.
 
     Parameters
@@ -193,7 +193,7 @@ _File = tuple[str, bytes, tuple[int, int], tuple[Mask, ...]]
 
 
 def _colour_file(frame: Frame, coloured: Coloured | None) -> _File | None:
-    """Return suffix, content, (height, width) and snapped masks of a colour image, or None."""
+    """Return suffix, content, (height, width) and masks of a colour image; None without one."""
     if coloured is None or coloured.view.image.height <= 1:
         return None
     image = coloured.view.image
@@ -204,7 +204,7 @@ def _colour_file(frame: Frame, coloured: Coloured | None) -> _File | None:
 
 
 def _depth_file(labelled: LabelledFrame, frame: Frame) -> _File | None:
-    """Return suffix, content, (height, width) and masks of a depth image (PNG), or None."""
+    """Return suffix, content, (height, width) and masks of a depth image; None for a cloud."""
     if frame.depth is None:
         return None
     masks = dense_masks(frame, [item.indices for item in labelled.objects])

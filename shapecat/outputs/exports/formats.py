@@ -44,8 +44,8 @@ __all__ = [
 ]
 
 Write = Callable[[Path, Iterable[ExportedFrame], FinishedRun], int]
-"""Writes the frames of a run, each with its depth and colour images, into a folder; returns the
-number of objects written."""
+"""A function that writes the frames of a run, each with its depth and colour images, into a folder,
+and returns the number of objects written."""
 
 
 @dataclass(frozen=True)
@@ -89,14 +89,14 @@ def export_run(
     """Export the labels of a finished run with their points.
 
     Crops are added to the data set ``out``. The other formats are written to ``out/NAME``, where
-    NAME is the name of the run folder; only an earlier export is replaced. Frames without a pose in
-    the fixed frame are left out if it exists: their objects have no tracks, and so no labels.
+    NAME is the name of the run folder; only an earlier export is replaced. If the run has a fixed
+    frame, frames without a pose in it are left out: their objects have no tracks and no labels.
 
     Parameters
     ----------
     format : a key of `FORMATS`.
     every : export every n-th frame of a stream.
-    visible_boxes : whether boxes enclose only the visible part of objects, not the whole.
+    visible_boxes : whether boxes enclose the visible part of objects instead of the whole.
     categories : the categories of all runs that are exported together; they are numbered alike.
     recording : path of the recording; None means the path where it was processed.
     observe : called with the phase, the number of frames done, and the total.
@@ -241,7 +241,7 @@ def _staged(
 
 
 def _mark(folder: Path, about: Mapping[str, Any]) -> None:
-    """Write export.json, the marker of an export: ``about``, and the names in its folder."""
+    """Write export.json, the marker of an export, with ``about`` and the names in ``folder``."""
     names = sorted(path.name for path in folder.iterdir() if path.name != _MARK)
     with replacing(folder / _MARK) as path:
         path.write_text(json.dumps({**about, "made": names}, indent=1) + "\n", "utf-8")
@@ -271,7 +271,7 @@ def _made_by_export(folder: Path) -> Collection[str] | None:
 
 
 def _tracked(frames: Iterable[LabelledFrame], placed: Collection[str]) -> Iterator[LabelledFrame]:
-    """Leave out untracked frames: those of topics ``placed`` in the fixed frame without a pose."""
+    """Leave out frames without a pose if their topic is tracked in the fixed frame (``placed``)."""
     return (f for f in frames if f.fixed_from_sensor is not None or f.topic not in placed)
 
 
@@ -312,8 +312,8 @@ def _require_own(target: Path, about: Mapping[str, Any]) -> None:
 def _covers(new: Any, old: Any) -> bool:
     """Return whether the time range ``new`` includes ``old``.
 
-    A range is (start, end) in seconds, where None is the start or end of the recording; a data set
-    has no range, but None.
+    A range is (start, end) in seconds, where None is the start or end of the recording. The range
+    of a data set is None.
     """
     if new is None or old is None:
         return new is old

@@ -2,7 +2,8 @@
 
 A label is a class and an instance (the track number); 0 means no object. ``labels.json`` lists the
 classes and the category of each instance. Source of the binary format: the description of
-SemanticKITTI (Behley 2019), uint32 with the class in the lower 16 bits, the instance above.
+SemanticKITTI (Behley 2019): uint32 with the class in the lower and the instance in the upper 16
+bits.
 """
 
 import csv
@@ -30,9 +31,9 @@ _INDEX = ("number", "topic", "frame", "stamp_ns", "width", "height", "fx", "fy",
 def write_point_labels(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
     """Write the labels of all points; return the number of objects.
 
-    For depth images it writes depth/ (millimetres), semantic/ and instance/ as 16-bit PNG; for
-    clouds velodyne/ (x, y, z and 0 for each point with depth, sensor frame) and labels/.
-    frames.csv lists the frame of each number, and its camera.
+    Depth images give depth/ (millimetres), semantic/ and instance/ as 16-bit PNG. Clouds give
+    velodyne/ (x, y, z and 0 for each point with depth, sensor frame) and labels/. frames.csv lists
+    the frame of each number, and its camera.
 
     Raises
     ------

@@ -78,7 +78,7 @@ def card_html(card: Card, categories: Sequence[str], names: Sequence[str], end: 
 
 
 def _guess(row: TrackRow) -> str:
-    """Return the most likely category of an unknown object; empty for other objects."""
+    """Return HTML with the most likely category of an unknown object; empty for other objects."""
     guess = row.cells.get("guess", "")
     if row.category != UNKNOWN or not guess:
         return ""
@@ -122,7 +122,7 @@ def _facts(card: Card) -> list[str]:
 
 
 def _bars(line: Timeline, categories: Sequence[str], row: TrackRow, names: Sequence[str]) -> str:
-    """Return the posterior of all views as bars, the most likely first; each bar is a button."""
+    """Return a button for each category, the most likely first, with a bar for its posterior."""
     shares = dict(zip(categories, line.fused.tolist(), strict=False))
     order = sorted(shares, key=lambda name: -shares[name])
     if row.category not in shares and row.category != UNKNOWN:
@@ -146,7 +146,7 @@ def _bar(name: str, share: float, digit: str) -> str:
 
 
 def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
-    """Return a plot of the causal posterior over time, with the times of detection below it.
+    """Return an SVG plot of the causal posterior, with the times of detection below it.
 
     It is empty if the recording has a single frame.
     """
@@ -182,7 +182,7 @@ def _few(count: int) -> I4:
 
 
 def _spans(seconds: F8, visible: Bool, scale: float) -> list[tuple[float, float]]:
-    """Return start and end, times ``scale``, of each interval of detections without a gap."""
+    """Return start and end, multiplied by ``scale``, of each interval of unbroken detection."""
     changes = np.diff(visible.astype(int), prepend=0, append=0)
     starts, ends = np.flatnonzero(changes == 1), np.flatnonzero(changes == -1) - 1
     return [(seconds[a] * scale, seconds[b] * scale) for a, b in zip(starts, ends, strict=True)]

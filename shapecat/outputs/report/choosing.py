@@ -1,4 +1,4 @@
-"""Choose the frames that the report reads again: good views of each track, and a strip.
+"""Choose the frames that the report reads again: good views of each track, and an overview strip.
 
 Both are chosen from the tables alone, before the recording is opened.
 """
@@ -102,7 +102,7 @@ def _areas(masks: Iterator[tuple[Key, ImageMasks]]) -> dict[Detected, tuple[floa
 def _representative_views(views: Sequence[_View]) -> list[_View]:
     """Return a large view from each of `_CANDIDATES` parts of a track.
 
-    It is complete if the part has a complete view. Among equal views, the first is taken.
+    The view is complete if the part has a complete one. Among equal views, the first is taken.
     """
     ends = np.linspace(0, len(views), min(_CANDIDATES, len(views)) + 1).astype(int)
     chosen = []
@@ -118,10 +118,9 @@ def _strip(
 ) -> dict[Key, float]:
     """Return one frame of each part of a run, with its seconds since the first frame.
 
-    ``stamps`` are the stamp (ns) and the key of each frame, sorted by time.
-
     It is the frame with the most tracks that no earlier frame of the strip shows. Among equal
     frames, it is the one with the most tracks, then the one nearest to the middle of the part.
+    ``stamps`` are the stamp (ns) and the key of each frame, sorted by time.
     """
     covered: set[tuple[str, int]] = set()
     strip = {}

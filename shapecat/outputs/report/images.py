@@ -51,13 +51,13 @@ Window = tuple[int, int, int, int]
 
 
 class FramePicture(Record):
-    """A frame with all data for its pictures.
+    """A frame prepared for pictures.
 
     Attributes
     ----------
     masks : the mask of each object of the frame, in order.
     hidden : (n,) fraction of each object's outline along which something nearer occludes it.
-    image_frame : the frame as a depth image; that of a cloud is seen by a virtual camera.
+    image_frame : the frame as a depth image; a cloud is projected into a virtual camera.
     colour : (h, w, 3) red, green, blue; None if the depth image is shown.
     """
 
@@ -145,7 +145,7 @@ def _upright(points: F4, up: F4) -> F8:
 
 
 def _hidden_share(depth: F4 | None, pixels: U4) -> float:
-    """Return the fraction of an object's outline along which something outside it is nearer.
+    """Return the fraction of an object's outline along which the pixels outside are nearer.
 
     ``depth`` is (h, w) in metres, ``pixels`` (n,) are flat indices of the object.
     """
@@ -283,7 +283,7 @@ def _border_share(mask: Mask, height: int, width: int) -> float:
 
 
 def _detail(image: FramePicture, mask: Mask) -> float:
-    """Return the standard deviation of the Laplacian on an object's crop, grey levels."""
+    """Return the standard deviation of the Laplacian within an object's crop, grey levels."""
     window = _window(image, mask)
     grey = np.asarray(_cut(image, window).convert("L"), np.float32)
     inside = _inside(mask.full(*image.shape), window, grey.shape)

@@ -1,4 +1,4 @@
-"""The report of a run as one HTML page that works as a file, and the index of several runs."""
+"""The report of a run as one HTML page that needs no other file, and the index of several runs."""
 
 import hashlib
 import json

@@ -46,7 +46,7 @@ class StripFrame(NamedTuple):
     """A frame as a data URI, its size, and its time in seconds since the first frame.
 
     ``boxes`` are left, top, width and height of each track, in pixels of the picture. ``shaded``
-    says whether it is a shaded depth image, not a colour image.
+    says whether the picture is a shaded depth image instead of a colour image.
     """
 
     image: str
@@ -173,7 +173,7 @@ def _snapshot(labelled: LabelledFrame, frame: Frame | None, item: LabelledObject
 
 
 def _points(frame: Frame | None, item: LabelledObject) -> F4:
-    """Return at most about `MOST_POINTS` points (n, 3) of an object, metres, sensor frame."""
+    """Return at most `MOST_POINTS` points (n, 3) of an object, metres, sensor frame."""
     if frame is None:
         return np.zeros((0, 3), np.float32)
     return finite_points(frame, item.indices[:: 1 + item.indices.size // MOST_POINTS])

@@ -110,7 +110,7 @@ def _labels(report: RunReport) -> dict[int, str]:
 
 
 def _correction(body: bytes) -> tuple[int, str, str] | None:
-    """Return track, label and the label seen before; None if the body is malformed."""
+    """Return track, label and the label that the page showed before; None if malformed."""
     try:
         correction = json.loads(body)
         track, label, previous = correction["track"], correction["label"], correction["seen"]
@@ -186,7 +186,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the name is given
-        """Log without the token."""
+        """Log a message without the token."""
         _log.info("%s", (format % args).replace(self.server.site.token, "…"))
 
 

@@ -114,7 +114,7 @@ def _shade(spots: F8) -> U1:
     """Return an image (h, w) of shades from 1 to `_SHADES`, 0 where there is no point.
 
     Points are drawn as discs, the nearest in front. The surface is lit from above left, with
-    normals from the slopes of its smoothed nearness.
+    normals from the slopes of its smoothed nearness. ``spots`` is from `_project`.
     """
     heights = _closed(_nearest(spots))
     bare = ~np.isfinite(heights)

@@ -32,7 +32,7 @@ PAGE, INDEX = "report.html", "index.html"
 _MANIFEST = "manifest.jsonl"
 """The file in which a batch records the state of each recording."""
 _MARK = b'<p class="kicker">shapecat report</p>'
-"""Text by which an index.html that any version of shapecat made is recognized."""
+"""Text that marks an index.html as made by shapecat, in any version."""
 _FACES = 6
 _REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
 
@@ -43,7 +43,7 @@ class RunReport:
 
     Attributes
     ----------
-    work : ``work`` in run.json, by which a replaced run is noticed.
+    work : the id ``work`` in run.json, which shows whether the run has been replaced.
     stages : (frames,) seconds of each stage.
     length_s : time from the first to the last frame, seconds.
     index : link to the index of several runs; None if there is none.
@@ -159,9 +159,9 @@ class Reports:
 
         Raises
         ------
-        OutputError : shapecat did not make the index that is there, and nothing is written; or a
-            page cannot be written, a tracks.csv is invalid, or a run has been replaced, and the
-            other pages are written.
+        OutputError : the existing index is not from shapecat (then nothing is written); or a page
+            cannot be written, a tracks.csv is invalid, or a run has been replaced (then the other
+            pages are written).
         """
         pages: dict[Path, Callable[[], str]] = {r.folder / PAGE: r.page for r in self.runs}
         if self.indexed and self.runs:
@@ -228,7 +228,7 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
 
 
 def _failed_recordings(manifest: Path) -> set[str]:
-    """Return the run folders that failed in a batch; none without a readable manifest."""
+    """Return the names of run folders that failed in a batch; none if the manifest is missing."""
     states: dict[str, str] = {}
     with suppress(OSError), manifest.open("rb") as lines:
         for line in lines:

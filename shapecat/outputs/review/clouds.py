@@ -103,8 +103,8 @@ def _radius(frame: Frame, points: F4, step: int) -> float:
 def _thin(wanted: Bool, limit: int) -> tuple[int, I4]:
     """Return a step, and the flat indices of about ``limit`` of the wanted pixels or points.
 
-    In an image (h, w), pixels on a grid with this step are chosen; of the wanted points of a cloud
-    (n,), every ``step``-th. A limit of 0 means all.
+    In an image (h, w), the wanted pixels on a grid with this step are chosen. In a cloud (n,),
+    every ``step``-th of the wanted points is chosen. A limit of 0 means all.
     """
     share = np.count_nonzero(wanted) / limit if limit else 1.0
     if wanted.ndim == 1:
@@ -116,7 +116,7 @@ def _thin(wanted: Bool, limit: int) -> tuple[int, I4]:
 
 
 def _plane_rows(planes: Sequence[Plane]) -> F4:
-    """Return normal, offset, centre of the outline and its squared radius, (p, 8), metres."""
+    """Return a row for each plane, (p, 8): normal, offset, centre and squared radius, metres."""
     rows = []
     for plane in planes:
         middle = plane.outline.mean(axis=0) if len(plane.outline) else np.zeros(3)
@@ -133,7 +133,7 @@ def _colours(points: F4, light: F4, tones: U2, palette: U1, planes: F4, plane_to
     ----------
     points : (n, 3) metres, sensor frame.
     light : (n,) factors of brightness.
-    tones : (n,) indices into the palette; points of index 0 get the colour of a near plane.
+    tones : (n,) indices into the palette; points of index 0 get the colour of a plane nearby.
     palette : (k, 3); the last ``plane_tones`` entries are for planes, in turn.
     planes : (p, 8), from `_plane_rows`.
     """

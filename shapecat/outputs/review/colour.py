@@ -14,7 +14,7 @@ __all__ = ["true_colours"]
 _TINT = 0.35
 """Fraction of the category's colour in the colour of an object."""
 _HIDDEN = 0.05
-"""A point is occluded if another one is nearer by more than this fraction of its depth."""
+"""A point is occluded if another one is nearer by more than this fraction of the point's depth."""
 
 
 def true_colours(
@@ -59,7 +59,8 @@ def _hide(projected: F4, shape: tuple[int, int], cell: float, share: float) -> N
     projected : (n, 3) column and row in pixels, and depth in metres; changed in place.
     shape : height and width of the image.
     cell : size of the cells in which the nearest point is found, pixels.
-    share : a point is occluded if the nearest depth is less than this fraction of its own.
+    share : a point is occluded if the nearest depth in its cell is less than this fraction of its
+        own depth.
     """
     cells = np.zeros((int(shape[0] / cell) + 2, int(shape[1] / cell) + 2), np.float32)
     for i in range(projected.shape[0]):
@@ -89,7 +90,8 @@ def _take(
     ----------
     image : (h, w, 3) red, green, blue; may be smaller than the recorded image.
     shape : height and width of the recorded image.
-    projected : (n, 2) or (n, 3), first column and row in the recorded image; NaN if not visible.
+    projected : (n, 2) or (n, 3); the first two values are the column and row in the recorded image,
+        and the column is NaN if the point is not visible.
     palette, tones : as for `true_colours`.
     """
     height, width, _ = image.shape

@@ -23,7 +23,7 @@ _NUMBERS = 1 << 17
 
 
 class Drawing(NamedTuple):
-    """How an entity is drawn: the function that turns rows into columns, and a static style."""
+    """The function that turns the rows of an entity into columns, and the entity's static style."""
 
     columns: Callable[[Sequence[Any]], Iterable[rr.ComponentColumn]]
     style: rr.AsComponents | None = None

@@ -22,7 +22,10 @@ _PATIENCE_S = 60.0
 
 
 class ReviewFile:
-    """A thread that copies Rerun's output from a pipe to a file; after an error, it discards it."""
+    """Copies Rerun's output from a pipe to a file, in a thread.
+
+    After an error, further output is discarded.
+    """
 
     def __init__(self, stream: rr.RecordingStream, file: IO[bytes]) -> None:
         """Connect ``stream`` to ``file``."""

@@ -117,7 +117,7 @@ def _captions(rows: Sequence[_Boxes]) -> Iterable[rr.ComponentColumn]:
 
 
 def _joined(rows: Sequence[_Boxes]) -> tuple[F4, U1, list[int]]:
-    """Return the boxes (n, 4) and colours (n, 3) of all images, and the number in each image."""
+    """Return the boxes (n, 4) and colours (n, 3) of all images, and the box count of each."""
     tones = [tone for _, tones, _ in rows for tone in tones]
     boxes = np.concatenate([boxes for boxes, _, _ in rows])
     counts = [len(texts) for _, _, texts in rows]

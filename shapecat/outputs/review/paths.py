@@ -12,7 +12,7 @@ from shapecat.outputs.review.shapes import PATHS
 __all__ = ["Paths"]
 
 _STEP_M = 0.015
-"""Distance from the last position of a path at which another is added, metres."""
+"""An object must move this far, in metres, before its path gets another position."""
 _POINTS = 500
 """Maximum number of positions of a path; the oldest are dropped."""
 
@@ -30,7 +30,7 @@ class _Path:
         return len(self.places) > 1
 
     def grow(self, place: F8) -> bool:
-        """Add a position if the object has moved; return whether the path has changed."""
+        """Add a position if the object has moved; return whether the drawn path has changed."""
         if self.places and np.linalg.norm(place - self.places[-1]) <= _STEP_M:
             return False
         self.places.append(place)

@@ -145,7 +145,7 @@ def _graphs(scenes: Sequence[DrawnScene]) -> _Columns:
 
 
 def _segments(pairs: F4) -> pa.Array:
-    """Return lines (n, 2, 3) as Rerun stores them; its own conversion is slow."""
+    """Return lines (n, 2, 3) in the form that Rerun stores; Rerun's own conversion is slow."""
     kind = rr.components.LineStrip3DBatch._ARROW_DATATYPE  # noqa: SLF001  no public name
     flat = pa.array(np.ascontiguousarray(pairs, np.float32).ravel())
     corners = pa.FixedSizeListArray.from_arrays(flat, type=kind.value_type)
@@ -193,7 +193,7 @@ def _fan(corners: int) -> U4:
 
 
 def _mesh(parts: Sequence[tuple[int, U4]]) -> U4:
-    """Join parts, each a number of vertices and triangles (n, 3), to the triangles of one mesh."""
+    """Return the triangles of a mesh that joins parts, each a vertex count and triangles (n, 3)."""
     starts = np.cumsum([0, *(vertices for vertices, _ in parts)])
     faces = [triangles + start for (_, triangles), start in zip(parts, starts, strict=False)]
     return np.concatenate(faces).astype(np.uint32) if faces else np.zeros((0, 3), np.uint32)
@@ -215,13 +215,13 @@ SCENE: Mapping[str, Drawing] = {
     "objects/graphs": Drawing(_graphs, rr.LineStrips3D.from_fields(radii=0.0008)),
     "objects/surfaces": Drawing(_surfaces),
 }
-"""The `Drawing` of each entity below the scene, made from a `DrawnScene` a few times a second."""
+"""The `Drawing` of each entity of a scene; each draws a `DrawnScene`, a few times per second."""
 SKETCH: Mapping[str, Drawing] = {
     # Labels of boxes would cover the objects.
     "objects/boxes": Drawing(_boxes, rr.Boxes3D.from_fields(radii=0.001, show_labels=False)),
     "objects/captions": Drawing(_captions, rr.Points3D.from_fields(radii=0.0005, show_labels=True)),
 }
-"""The `Drawing` of each entity below the sensor, made from the objects' `Sketch` in every frame."""
+"""The `Drawing` of each entity that is drawn in every frame, from a `Sketch` of each object."""
 
 
 def _paths(snapshots: Sequence[Sequence[_Way]]) -> _Columns:
