@@ -65,7 +65,7 @@ def undistorted_rays(camera: Camera, model: str, coefficients: Sequence[float]) 
     Returns
     -------
     (h, w, 2) slopes, NaN at pixels where the iteration does not converge; None if it converges
-    at fewer than 30 % of them, the model is not known, or the coefficients are not finite.
+    at fewer than 30 % of the pixels, the model is not known, or a coefficient is not finite.
     """
     if model not in LENS_MODELS or not np.isfinite(coefficients).all():
         return None

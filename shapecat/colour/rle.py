@@ -34,7 +34,7 @@ def rle_mask(counts: U4 | Sequence[int], height: int, width: int) -> Mask:
 
     Raises
     ------
-    ValueError : a run length is negative, or they do not add up to ``height * width``.
+    ValueError : a run length is negative, or the sum is not ``height * width``.
 
     Examples
     --------

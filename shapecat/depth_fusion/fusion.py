@@ -131,7 +131,7 @@ def _expected_depth(depth: F4, range_m: float) -> F4:
 
 @kernel
 def _agreeing_share(expected: F4, earlier: F4, homography: F4, shift: F4) -> float:
-    """Return the fraction of depths, among those in both images, that show the same surface."""
+    """Return the fraction of pixels with depth in both images whose depths agree."""
     columns = expected.shape[1]
     places = np.zeros((3, columns), np.float32)
     x, y, z = places[0], places[1], places[2]
