@@ -22,7 +22,7 @@ _AHEAD = 4
 
 @dataclass(frozen=True)
 class Coloured:
-    """The colour image of a frame, and a mask for each of its objects, in their order."""
+    """The colour image of a frame, and the mask of each object of the frame, in order."""
 
     view: ColourView
     masks: tuple[Mask, ...]
@@ -35,7 +35,7 @@ ExportedFrame = tuple[LabelledFrame, Frame, Coloured | None]
 def with_colour(
     labelled: Iterable[LabelledFrame], recording: Recording, run: RunInfo
 ) -> Iterator[ExportedFrame]:
-    """Pair labelled frames with their frames and colour images from the recording.
+    """Pair labelled frames with the frames and colour images of the recording.
 
     From an indexed file, only the requested frames are read.
 
@@ -112,7 +112,7 @@ class _Awaited:
 
 
 def _coloured(labelled: LabelledFrame, view: ColourView | None) -> Coloured | None:
-    """Return the colour image of a frame with the masks of its objects; None if it has none."""
+    """Return the colour image of a frame with the masks of its objects; None without an image."""
     if view is None or labelled.masks is None:
         return None
     masks = labelled.masks

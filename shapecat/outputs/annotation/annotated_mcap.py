@@ -160,8 +160,8 @@ def _append(
 def _annotations(frames: Iterable[AnnotationFrame]) -> Iterator[Annotation]:
     """Add to each frame the lifetime of its boxes, and the tracks whose boxes it removes.
 
-    The lifetime follows from the time to the next frame. The removed boxes are those of earlier
-    frames whose track no sensor sees any more.
+    The lifetime follows from the time to the next frame. A box of an earlier frame is removed if no
+    sensor sees its track any more.
     """
     visible: dict[str, set[int]] = {}
     for frame, period in _with_periods(frames):
@@ -174,7 +174,7 @@ def _annotations(frames: Iterable[AnnotationFrame]) -> Iterator[Annotation]:
 
 
 def _with_periods(frames: Iterable[AnnotationFrame]) -> Iterator[tuple[AnnotationFrame, int]]:
-    """Yield each frame with the time to the next one of its topic, ns.
+    """Yield each frame with the time to the next frame of its topic, ns.
 
     The last frame of a topic gets the time since the frame before it.
     """

@@ -85,7 +85,10 @@ class _Target:
         self.writer.add_message(number, *times, message.sequence)
 
     def number(self, channel: Channel) -> _Registered:
-        """Return the number of a channel, and the function that converts its messages, or None."""
+        """Return the number of a channel, and the function that converts its messages, or None.
+
+        A new channel is registered first.
+        """
         if channel not in self.known:
             self.known[channel] = self._register(channel)
         return self.known[channel]

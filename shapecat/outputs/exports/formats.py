@@ -276,7 +276,7 @@ def _tracked(frames: Iterable[LabelledFrame], placed: Collection[str]) -> Iterat
 
 
 def _require_own(target: Path, about: Mapping[str, Any]) -> None:
-    """Check that a folder is missing, empty, or an unchanged earlier export that this one covers.
+    """Check that a folder is missing, empty, or an unchanged export that the new one covers.
 
     Raises
     ------

@@ -88,7 +88,7 @@ class _View(NamedTuple):
 
 
 def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None) -> _View:
-    """Write the colour image of a frame; return its camera, or without one the depth camera."""
+    """Write the colour image of a frame, if any; return its camera, or else the depth camera."""
     depth_view = _View(frame.camera, IDENTITY)
     if coloured is None or coloured.view.image.height <= 1:
         return depth_view

@@ -1,9 +1,8 @@
 """Point labels: masks for depth images, SemanticKITTI labels for unorganized clouds.
 
 A label is a class and an instance (the track number); 0 means no object. ``labels.json`` lists the
-classes and the category of each instance. Source of the binary format: the description of
-SemanticKITTI (Behley 2019): uint32 with the class in the lower and the instance in the upper 16
-bits.
+classes and the category of each instance. The binary format is that of SemanticKITTI (Behley 2019):
+uint32 with the class in the lower and the instance in the upper 16 bits.
 """
 
 import csv

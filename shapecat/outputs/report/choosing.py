@@ -37,7 +37,7 @@ class Choice:
     Attributes
     ----------
     candidates : for each frame, the tracks that it shows well.
-    strip : the frames of the strip, with their time in seconds since the first frame.
+    strip : the frames of the overview strip, with their time in seconds since the first frame.
     """
 
     candidates: Mapping[Key, frozenset[int]]

@@ -131,7 +131,7 @@ def index_page(title: str, runs: Sequence[Listed], notes: Sequence[str] = ()) ->
 
 
 def _head(title: str, scripts: str = "") -> str:
-    """Return the head of a page; ``scripts`` is the part of its security policy for scripts."""
+    """Return the head of a page; ``scripts`` is added to its content security policy."""
     filled = template("head.html").substitute(
         title=escape(title), style=asset("report.css"), scripts=scripts
     )

@@ -84,7 +84,7 @@ def paint(
 def _shaded(
     frame: Frame, pixels: I4, points: F4, tones: U2, palette: U1, planes: Sequence[Plane]
 ) -> U4:
-    """Return the colours (n,) of points, 0xRRGGBBAA, by object or plane, and shaded."""
+    """Return the shaded colours (n,) of points, 0xRRGGBBAA, by object or plane."""
     light = np.ones(pixels.size, np.float32)
     if frame.depth is not None and frame.camera is not None:
         light = _light(frame.depth, pixels, frame.camera.fx, frame.camera.fy)
@@ -116,7 +116,7 @@ def _thin(wanted: Bool, limit: int) -> tuple[int, I4]:
 
 
 def _plane_rows(planes: Sequence[Plane]) -> F4:
-    """Return a row for each plane, (p, 8): normal, offset, centre and squared radius, metres."""
+    """Return (p, 8) normal, offset, centre and squared radius of each plane's outline, metres."""
     rows = []
     for plane in planes:
         middle = plane.outline.mean(axis=0) if len(plane.outline) else np.zeros(3)

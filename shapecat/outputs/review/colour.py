@@ -66,7 +66,7 @@ def _hide(projected: F4, shape: tuple[int, int], cell: float, share: float) -> N
     for i in range(projected.shape[0]):
         u, v, z = projected[i, 0], projected[i, 1], projected[i, 2]
         if -0.5 < u < shape[1] - 0.5 and -0.5 < v < shape[0] - 0.5 and z > 0:
-            # Into the four nearest cells, since neighbours may be more than a cell apart.
+            # Fill the four nearest cells, since neighbours may be more than a cell apart.
             x, y = int(u / cell + 0.5), int(v / cell + 0.5)
             for row in (max(y - 1, 0), y):
                 for column in (max(x - 1, 0), x):

@@ -228,7 +228,7 @@ class _Review:
             self._columns.add(f"{entity}/{name}", at, scene, drawing, size=scene.size)
 
     def _place_sensor(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
-        """Choose the eye, and write the axes and the frustum of the sensor, if they are new."""
+        """Write the axes and the frustum of the sensor if they are new, and choose its eye."""
         topic = labelled.topic
         if topic not in self._eyes or (labelled.objects and topic not in self._aimed):
             self._eyes[topic] = choose_eye(labelled, frame, fixed=self._fixed_frame is not None)
