@@ -36,7 +36,7 @@ __all__ = ["write_annotated"]
 _LIFETIME = 1.5
 """Lifetime of boxes in viewers, as a multiple of the frame period."""
 _BUFFER = 4 << 20
-"""Size of the write buffer, bytes; large, since two threads that write to one file alternate."""
+"""Size of the write buffer, bytes; large, since a thread waits while another writes to the file."""
 _PERIOD_NS = 1_000_000_000
 """Frame period assumed for a stream with a single frame."""
 _LONGEST_NS = 3600 * 10**9

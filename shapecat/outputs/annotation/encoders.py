@@ -38,9 +38,9 @@ _INCOMPLETE = (
     "vision_msgs/msg/Pose2D",
     "visualization_msgs/msg/Marker",
 )
-"""ROS types of which only some fields are set; the others are zero.
+"""ROS types whose messages are filled with zeros before some of their fields are set.
 
-Only messages of these types are filled with zeros first, since that takes time.
+In messages of the other types, all fields are set, and to fill them first would only take time.
 """
 
 
