@@ -1,4 +1,4 @@
-"""Frames of a depth sensor, each with the colour image nearest to it in time."""
+"""Read frames, each with the colour image nearest to it in time."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,18 +27,18 @@ from shapecat.types import Camera, Frame
 __all__ = ["KnownImages", "frames_with_colour"]
 
 _HELD_FRAMES = 8
-"""At most this many frames wait for a later colour image."""
+"""Maximum number of frames that wait for a later colour image."""
 _KEPT_IMAGES = 64
 """Maximum number of colour images kept for later frames. A frame may be logged a second after its
 image, and cameras give up to 60 images per second."""
 _BUFFERED_BYTES = 96 << 20
-"""Maximum size of these images together; two are kept in any case."""
+"""Maximum total size of the kept images, bytes; two images are kept in any case."""
 _STAMP_BYTES = 12
-"""The first bytes of a ROS message hold its stamp, which a comparison of calibrations ignores."""
+"""Length of the start of a ROS message, with its stamp. Comparisons of calibrations ignore it."""
 _PATIENCE_NS = 500_000_000
-"""A frame waits no longer than this for a colour image, in log time."""
+"""Maximum log time that a frame waits for a colour image, nanoseconds."""
 _USUAL_PERIOD_NS = 100_000_000
-"""Image period assumed if neither stamps nor count and duration give one."""
+"""Period assumed for a colour stream if it has too few messages to measure one, nanoseconds."""
 KnownImages: TypeAlias = Callable[[str, int], int | None] | None
 """Returns the log time (ns) of a frame's colour image, given the frame's topic and number; None if
 the frame has no image."""
@@ -61,14 +61,13 @@ def frames_with_colour(
     colours : the colour stream of each depth topic that has one.
     frame_range, skipped : as for `frames`.
     needed : as for `frames`; also called for colour images.
-    same_images : returns the log time of a frame's image, ns, or None, given the frame's topic and
-        number; by default, the images nearest in time are chosen.
+    same_images : returns which images to use, see `KnownImages`; None for those nearest in time.
 
     Yields
     ------
     Each frame with the colour image that has the nearest stamp, or None if no readable image is
-    within half a period of the colour stream. Unless ``needed`` is given, warnings of the
-    recording count the missing images.
+    within half a period of the colour stream. Unless ``needed`` is given, a warning counts the
+    frames without an image.
     """
     partners = {
         stream.topic: _Partner(recording, stream, colours[stream.topic], same_images)
@@ -81,7 +80,7 @@ def frames_with_colour(
         streams,
         frame_range,
         skipped=skipped,
-        callbacks=_heard(partners),
+        callbacks=_callbacks(partners),
         needed=needed,
     )
     for frame in found:
@@ -96,7 +95,7 @@ def frames_with_colour(
         partner.report()
 
 
-def _heard(partners: Mapping[str, "_Partner"]) -> dict[str, Any]:
+def _callbacks(partners: Mapping[str, "_Partner"]) -> dict[str, Any]:
     """Return a callback for each colour topic and its calibration topic."""
     listeners: dict[str, list[Any]] = {}
     for partner in partners.values():
@@ -112,6 +111,7 @@ def _heard(partners: Mapping[str, "_Partner"]) -> dict[str, Any]:
 
 
 def _decided(waiting: Sequence[Frame], partners: Mapping[str, "_Partner"]) -> bool:
+    """Return whether the first waiting frame need not wait longer for its colour image."""
     first, last = waiting[0], waiting[-1]
     partner = partners.get(first.topic)
     return (
@@ -128,7 +128,7 @@ def _paired(frame: Frame, partners: Mapping[str, "_Partner"]) -> tuple[Frame, Co
 
 
 class _BufferedImage(NamedTuple):
-    """A decoded image message, and how often the clock had been set back before it."""
+    """A decoded image message, and how many times the clock had been set back before it."""
 
     stamp_ns: int
     log_time_ns: int
@@ -138,7 +138,7 @@ class _BufferedImage(NamedTuple):
 
 
 class _Partner:
-    """The latest colour images for one depth stream."""
+    """Keeps the latest colour images for one depth stream, and chooses one for each frame."""
 
     def __init__(
         self, recording: Recording, depth: Stream, colour: ColourStream, known: KnownImages
@@ -187,15 +187,15 @@ class _Partner:
             self._left_out[f"CameraInfo: {reason_of(error, self.stream.topic)}"] += 1
 
     def notice(self, frame: Frame) -> None:
-        """Note a new frame; if the clock was set back, the images so far are not for it."""
+        """Take note of a new frame, to detect that the clock was set back before it."""
         if frame.stamp_ns < self._latest:
             self._setbacks, self._newest = self._setbacks + 1, None
         self._latest = frame.stamp_ns
 
     def reaches(self, frame: Frame) -> bool:
-        """Return whether an image as new as a frame was read, so that no later one is nearer.
+        """Return whether the image of a frame, if it has one, has been read.
 
-        If the image of the frame is known, return whether it was read.
+        It has once an image with the same or a later stamp was read, since no later one is nearer.
         """
         if self._same_images is not None:
             return self._same_images(frame.topic, frame.index) is None or bool(
@@ -210,7 +210,7 @@ class _Partner:
             return [one for one in self._images if one.log_time_ns == logged]
         period = self._period()
         close = [one for one in self._images if 2 * abs(one.stamp_ns - frame.stamp_ns) <= period]
-        # If the clock was set back, images from before may have the same stamps.
+        # After the clock was set back, stamps repeat: leave out images from before.
         closest = min(close, key=lambda one: abs(one.log_time_ns - frame.log_time_ns), default=None)
         return [one for one in close if closest is None or one.setbacks == closest.setbacks]
 
@@ -233,10 +233,12 @@ class _Partner:
             self._recording.warn(f"{self.stream.topic}: frames without colour ({count}×): {reason}")
 
     def _too_much(self) -> bool:
+        """Return whether the kept images take too much memory."""
         stored_bytes = sum(image.bytes for image in self._images)
         return stored_bytes > _BUFFERED_BYTES and len(self._images) > 2
 
     def _period(self) -> int:
+        """Return the time between two images, nanoseconds."""
         if self._steps:
             return int(median(self._steps))
         count, span = self.stream.count, self._recording.end_ns - self._recording.start_ns
@@ -272,7 +274,7 @@ class _Partner:
         if pose is not None:
             offset = frame.frame_from_sensor
             return ColourView(image, lens, pose if offset is None else compose(pose, offset))
-        # Two cameras are never calibrated to the same numbers.
+        # Only registered images have the intrinsics of the depth camera.
         if same_shape and are_equal(lens, frame.camera):
             return ColourView(image, lens, None if straight else IDENTITY)
         names = (name or "a frame without a name" for name in (frame.frame_id, image.frame_id))
@@ -281,7 +283,7 @@ class _Partner:
 
     @cached_property
     def _first_lens(self) -> LensCamera | None:
-        """The lens of the first calibration in the recording, for images before it, or None."""
+        """The lens of the recording's first calibration, for images before it; None without one."""
         topic = self.stream.info_topic
         info = None if topic is None else first_message(self._recording, topic)
         with suppress(RecordingError, *MALFORMED):

@@ -40,8 +40,11 @@ _OTHER_WORDS = ("infra", "/ir/", "depth/image", "confidence", "thermal", "mask")
 class ColourStream:
     """A topic of colour images, or of clouds with a packed ``rgb`` field.
 
-    ``info_topic`` is the topic of the calibration, None if there is none; ``count`` is the number
-    of messages; ``frame_id`` and ``encoding`` are from the first image.
+    Attributes
+    ----------
+    info_topic : topic of the calibration; None if there is none.
+    count : number of messages.
+    frame_id, encoding : from the first image with colours.
     """
 
     topic: str
@@ -75,21 +78,21 @@ def pair_colours(
 
     A cloud with colours is its own colour stream. Colour images belong to a depth stream if they
     have the same frame or if the topic names begin with the same namespace
-    (``/camera/color/image_raw`` and ``/camera/depth/image_raw``), unless they share more of it with
-    another depth sensor. Among several, the preference is, in this order: the same frame, the
+    (``/camera/color/image_raw`` and ``/camera/depth/image_raw``), unless they share more components
+    with another depth sensor. Among several, the preference is, in this order: the same frame, the
     longest common namespace, a topic named after colour, rectified images, more messages,
     compressed images, the alphabetical order of topics. If a recording has one depth sensor and one
     stream of colour images, raw or compressed or both, they belong together whatever their names.
 
     Parameters
     ----------
-    requested : the topic for all depth streams, which may hold grey images or clouds; None to
-        choose one for each, empty for none.
+    requested : the colour topic to use for all depth streams; it may hold grey images or clouds.
+        None to choose a topic for each depth stream, empty to use no colour.
 
     Returns
     -------
-    The colour stream of each depth topic that has one. ``info_topic`` is None where the only
-    calibration nearby is the depth stream's.
+    The colour stream of each depth topic that has one. Its ``info_topic`` is None if it would be
+    that of the depth stream.
 
     Raises
     ------
@@ -114,7 +117,7 @@ def pair_colours(
 def _choose(
     recording: Recording, streams: Sequence[Stream], found: Sequence[ColourStream]
 ) -> dict[str, ColourStream]:
-    """Return the best of the colour streams that were found for each depth stream."""
+    """Return the best colour stream in ``found`` for each depth topic that has one."""
     images = [one for one in found if one.kind != "cloud" and not one.grey]
     sensors = by_sensor(depth_streams(recording)) if images else []
     nearest = {one.topic: _nearest_sensors(one, sensors) for one in images}
@@ -146,9 +149,9 @@ def _warn_about_unread(recording: Recording) -> None:
 
 
 class _NearSensor(NamedTuple):
-    """The streams of a sensor.
+    """The depth streams of a sensor near a colour topic.
 
-    ``shared`` is the largest number of namespace components that one of them shares with an image.
+    ``shared`` is the largest number of namespace components that one of them shares with the topic.
     """
 
     shared: int
@@ -158,9 +161,10 @@ class _NearSensor(NamedTuple):
 def _nearest_sensors(
     one: ColourStream, sensors: Sequence[Sequence[Stream]]
 ) -> dict[str, list[_NearSensor]]:
-    """Return the two sensors that share most of the namespace of images, for each kind of stream.
+    """Return the two sensors nearest to a colour topic, for each kind of depth stream.
 
-    Two are enough to compare any sensor with the nearest other one.
+    These share the most namespace components with it. Two are enough to compare any sensor with the
+    nearest other one.
     """
     nearest: dict[str, list[_NearSensor]] = {}
     for kind in ("depth", "points"):
@@ -176,7 +180,7 @@ def _nearest_sensors(
 def _belongs(
     one: ColourStream, stream: Stream, nearest: Mapping[str, Sequence[_NearSensor]]
 ) -> bool:
-    """Return whether images belong to a depth stream's sensor, see `pair_colours`."""
+    """Return whether colour images belong to the sensor of a depth stream, see `pair_colours`."""
     if same_frame(one.frame_id, stream.frame_id):
         return True
     shared = _shared(one, stream)
@@ -187,6 +191,12 @@ def _belongs(
 def _select(
     recording: Recording, streams: tuple[ColourStream, ...], requested: str
 ) -> ColourStream:
+    """Return the colour stream on the requested topic.
+
+    Raises
+    ------
+    NoStreamError : there is none.
+    """
     for one in streams:
         if one.topic.strip("/") == requested.strip("/"):
             return one
@@ -218,7 +228,7 @@ def _shared(one: ColourStream, stream: Stream) -> int:
 
 @lru_cache(maxsize=4096)
 def _namespace(topic: str) -> tuple[str, ...]:
-    """Return the components of a topic before its own name."""
+    """Return the components of a topic, without the last one."""
     return PurePosixPath(topic.strip("/")).parts[:-1]
 
 
@@ -263,4 +273,5 @@ _PROBES: dict[str, tuple[Literal["raw", "compressed", "cloud"], Callable[[Any], 
     COMPRESSED: ("compressed", _compressed_encoding),
     CLOUD: ("cloud", _cloud_encoding),
 }
-"""The kind of a stream, and what returns the encoding of a message, empty if it has no colours."""
+"""By message type, the kind of the stream, and a function that returns the encoding of a message,
+empty if it has no colours."""

@@ -11,19 +11,23 @@ _LOG = "-wal"
 
 
 def is_of_bag(name: str) -> bool:
-    """Return whether a file in the folder of a ROS 2 bag belongs to it: a part or the metadata."""
+    """Return whether a file name in the folder of a ROS 2 bag is that of its data or metadata."""
     return name == "metadata.yaml" or name.removesuffix(_LOG).endswith(_PARTS)
 
 
 def write_ahead_log(database: Path) -> Path | None:
     """Return a database's write-ahead log if it has messages that the database lacks, else None."""
     log = database.with_name(f"{database.name}{_LOG}")
-    there = os.path.isfile(log)  # noqa: PTH113  the other raises if its name is too long
+    there = os.path.isfile(log)  # noqa: PTH113  Path.is_file raises if the name is too long
     return log if there and log.stat().st_size else None
 
 
 def input_files(path: Path) -> list[Path]:
-    """Return a file and its write-ahead log, or the files of the ROS 2 bag in a folder, sorted."""
+    """Return the files of a recording.
+
+    For a file, these are the file and its write-ahead log, if any; for the folder of a ROS 2 bag,
+    its data and metadata, sorted. Empty logs are left out.
+    """
     if not path.is_dir():
         log = write_ahead_log(path)
         return [path] if log is None else [path, log]

@@ -15,7 +15,7 @@ from shapecat.types import Frame
 __all__ = ["ALL_FRAMES", "FrameRange", "frames"]
 
 _FAR_NS = 2**62
-"""A century: later times would not fit into the integers of a database."""
+"""More than a century. Later times would not fit into the integers of a database."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class FrameRange:
     every: int = 1
 
     def __post_init__(self) -> None:
-        """Check the numbers; NumPy's become plain ones, which can be written as JSON."""
+        """Check the values; convert NumPy numbers to plain ones, which can be written as JSON."""
         if self.every < 1 or self.every % 1:
             msg = f"every must be an integer of at least 1, got {self.every!r}"
             raise ConfigError(msg)
@@ -84,13 +84,13 @@ def frames(
     Parameters
     ----------
     skipped : receives the number of unreadable frames by reason; they raise no error.
-    callbacks : called with the messages of other topics, so that the file is read only once.
+    callbacks : by topic, functions to call with its messages, so that the file is read only once.
     needed : returns whether a frame, or a message for ``callbacks``, is needed, given its topic and
-        log time (ns). Others may be left out if the recording has an index.
+        log time (ns). Others may be left out if the recording has an index; None needs all.
 
     Yields
     ------
-    Frames by log time. ``index`` counts the stream's messages from 0 at ``start_s``.
+    Frames by log time. ``index`` counts the messages of its stream, from 0 at ``start_s``.
     """
     sources: dict[str, Source] = {
         stream.topic: SOURCES[stream.kind](recording, stream, skipped) for stream in streams

@@ -1,4 +1,4 @@
-"""Depth images from a lens with distortion."""
+"""Convert depth images with lens distortion to those of a pinhole camera, or to points."""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -22,7 +22,8 @@ def lens_content(
 
     Parameters
     ----------
-    info : a decoded CameraInfo, with its ``camera`` as `camera_of_info` returns it.
+    info : a decoded CameraInfo.
+    camera : the camera that `camera_of_info` returns for ``info``.
     depth : (h, w) metres.
     warn : receives warnings for the user.
     """
@@ -43,7 +44,14 @@ def lens_content(
 
 
 class _Lens(NamedTuple):
-    """The rays (h, w, 2) of pixels, the fraction of pixels without one, and a camera that fits."""
+    """The geometry of a lens.
+
+    Attributes
+    ----------
+    rays : (h, w, 2) x / z and y / z of each pixel's ray; NaN where the lens model has none.
+    blind : fraction of pixels without a ray.
+    fit : a pinhole camera with nearly the same rays; None if there is none.
+    """
 
     rays: F8
     blind: float
@@ -52,6 +60,7 @@ class _Lens(NamedTuple):
 
 @lru_cache(maxsize=4)  # the calibration of a camera hardly ever changes
 def _lens_of(camera: Camera, model: str, coefficients: tuple[float, ...]) -> _Lens | None:
+    """Compute the rays of a lens; return None if its distortion cannot be inverted."""
     rays = undistorted_rays(camera, model, coefficients)
     if rays is None:
         return None
@@ -60,7 +69,7 @@ def _lens_of(camera: Camera, model: str, coefficients: tuple[float, ...]) -> _Le
 
 
 def distortion_problem(model: str, coefficients: Sequence[float]) -> str:
-    """Return what is wrong with the distortion in a CameraInfo; empty if it is usable."""
+    """Describe the problem with the distortion in a CameraInfo; empty if it is usable."""
     if model not in LENS_MODELS:
         return f"unknown lens distortion {model!r}"
     return "" if np.isfinite(coefficients).all() else "lens distortion that is not finite"

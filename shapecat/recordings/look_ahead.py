@@ -17,16 +17,17 @@ its stamp, and publish transforms more often than this."""
 
 
 def is_read_at_once(recording: Recording) -> bool:
-    """Return whether all messages are read at the start: the recording is short or unindexed."""
+    """Return whether all messages are read at the start: the recording is short or has no index."""
     return recording.end_ns - recording.start_ns <= 2 * AROUND_NS or not recording.indexed
 
 
 class LookAhead:
-    """Hands over the messages of some topics, from shortly before the frames to shortly after them.
+    """Passes messages of some topics to a callback, from 10 s before each frame to 10 s after it.
 
     Attributes
     ----------
-    whole : whether all messages have been handed over: if `is_read_at_once`, or after `read_all`.
+    whole : whether all messages are passed on, regardless of the frames: if `is_read_at_once`, or
+        after `read_all`.
     """
 
     def __init__(
@@ -38,12 +39,13 @@ class LookAhead:
         *,
         skips: bool = True,
     ) -> None:
-        """Hand over the first messages.
+        """Pass on the first messages, or all if `is_read_at_once`.
 
         Parameters
         ----------
         take : called with each message, in the order of the recording.
-        forget : called with a stamp (ns). Of the messages before it, only the last is still needed.
+        forget : called with a stamp (ns) when messages with earlier stamps may be forgotten, except
+            for the last of them.
         skips : whether messages in a long gap between two frames may be left out.
         """
         self._recording, self._topics = recording, topics
@@ -54,12 +56,12 @@ class LookAhead:
         self._read_from(recording.start_ns)
 
     def read_all(self) -> None:
-        """Hand over all remaining messages; from now on, forget none."""
+        """Pass on all remaining messages; from now on, forget none."""
         self.whole = True
         self._read_until(None)
 
     def advance(self, log_time_ns: int, stamp_ns: int) -> None:
-        """Hand over the messages around a frame, given its log time and stamp in nanoseconds."""
+        """Pass on the messages around a frame, given its log time and stamp in nanoseconds."""
         if self.whole:
             return
         # The frames begin later, or have a gap.
@@ -74,6 +76,7 @@ class LookAhead:
             self._forget(before)
 
     def _read_from(self, log_time_ns: int) -> None:
+        """Restart reading at a log time (ns), and pass on the messages shortly after it."""
         start = None if self.whole else log_time_ns
         self._messages: Iterator[Message] = (
             self._recording.messages(self._topics, start_ns=start) if self._topics else iter(())
@@ -82,7 +85,7 @@ class LookAhead:
         self._read_until(None if self.whole else log_time_ns + AROUND_NS)
 
     def _read_until(self, log_time_ns: int | None) -> None:
-        """Hand over the messages up to a log time, all if it is None."""
+        """Pass on the messages up to a log time (ns), or all if it is None."""
         while self._next is not None and (
             log_time_ns is None or self._next.log_time_ns <= log_time_ns
         ):

@@ -28,13 +28,13 @@ Topics: TypeAlias = Collection[str] | None
 TimeLimit: TypeAlias = int | None
 """A log time in nanoseconds; None means no limit."""
 Needed: TypeAlias = Callable[[str, int], bool] | None
-"""Whether a message's data is needed, given its topic and log time (ns); None means always."""
+"""Returns whether a message's data is needed, from its topic and log time (ns); None: always."""
 
 
 _SMALL = 1 << 16  # bytes
 
 MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
-"""Raised by the use of a decoded message that lacks fields of its type, or has values of others."""
+"""Errors of code that uses a decoded message with missing fields, or with values of wrong types."""
 
 
 class MessageError(RecordingError):
@@ -42,7 +42,7 @@ class MessageError(RecordingError):
 
 
 def reason_of(error: Exception, topic: str) -> str:
-    """Return why a message of a topic is unusable, from a RecordingError or one of `MALFORMED`."""
+    """Return why a message of a topic is unusable, given a RecordingError or one of `MALFORMED`."""
     if isinstance(error, RecordingError):
         return str(error).removeprefix(f"{topic}: ")[:160]
     return "message does not match its type"
@@ -57,11 +57,11 @@ class Selection(NamedTuple):
     needed: Needed
 
     def has_topic(self, topic: str) -> bool:
-        """Return whether messages of a topic are read."""
+        """Return whether the messages of a topic are selected."""
         return self.topics is None or topic in self.topics
 
     def has_time(self, log_time_ns: int) -> bool:
-        """Return whether a message of this log time is read."""
+        """Return whether a message with this log time is selected."""
         begun = self.start_ns is None or log_time_ns >= self.start_ns
         return begun and (self.stop_ns is None or log_time_ns < self.stop_ns)
 
@@ -70,8 +70,8 @@ class Channel(NamedTuple):
     """A topic, with the type of its messages and the definition of that type.
 
     ``type`` is normalized to ``package/msg/Name`` for ROS types; ``schema_name`` is as recorded.
-    ``encoding`` of messages is cdr, ros1, json or protobuf. ``metadata`` holds entries that
-    recorders add, such as ``offered_qos_profiles``.
+    ``encoding`` is that of the messages, such as cdr, ros1, json or protobuf. ``metadata`` holds
+    entries that recorders add, such as ``offered_qos_profiles``.
     """
 
     topic: str
@@ -119,7 +119,7 @@ def detached(data: bytes | memoryview) -> bytes | memoryview:
 
 
 def sum_topics(topics: Iterable[Topic]) -> tuple[Topic, ...]:
-    """Return topics sorted; equal ones become one, and their messages are added up."""
+    """Merge topics with the same name, type and encoding, and add up their counts; sort them."""
     counts: Counter[tuple[str, str, str]] = Counter()
     for topic in topics:
         counts[topic.name, topic.type, topic.encoding] += topic.count

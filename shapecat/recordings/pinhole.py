@@ -1,4 +1,4 @@
-"""The pinhole camera behind an organized cloud or a camera calibration."""
+"""Find the pinhole camera of an organized cloud or of a CameraInfo."""
 
 import re
 from collections.abc import Callable
@@ -25,12 +25,13 @@ __all__ = [
 _LARGEST_ERROR_PX = 0.6
 """A camera fits an organized cloud if 95 % of its points are reprojected within this distance."""
 _OFF_CENTER = 0.12
-"""Fraction of the width or height. Depth cameras stay below 0.05; intrinsics for 640 x 480 pixels
-with images of 848 x 480 have 0.123."""
+"""Largest plausible distance of the principal point from the image centre, as a fraction of the
+width or height. Depth cameras stay below 0.05; intrinsics for 640 x 480 pixels give 0.123 in images
+of 848 x 480."""
 _UNIT = 1
-"""Focal length in a matrix that is the identity because the driver left it out."""
+"""Focal length in an identity matrix, which drivers write if they know no intrinsics."""
 _LARGEST_PX = 1e5
-"""Largest intrinsic parameter: a view of half a degree. Damaged calibrations exceed it."""
+"""Largest plausible intrinsic parameter, pixels: a field of view of about half a degree."""
 _SAMPLES = 4096
 _FEWEST = 100
 _SPREAD = 0.1
@@ -58,8 +59,8 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
 
     Returns
     -------
-    The fit; None if there are few points, or they cover a narrow part of the image, or no camera
-    reprojects 95 % of them to within 0.6 pixels.
+    The fit; None if there are fewer than about a hundred points, or they span less than a tenth of
+    the width or height, or no camera reprojects 95 % of them to within 0.6 pixels.
     """
     height, width = points.shape[:2]
     sample = _sample(points)
@@ -83,7 +84,10 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
 
 
 def still_fits(fit: PinholeFit, points: F4) -> bool:
-    """Return whether the camera of a fit also fits another organized cloud (h, w, 3)."""
+    """Return whether a fitted camera also fits another organized cloud (h, w, 3).
+
+    The result is True if the cloud has too few points to tell, False if it has another size.
+    """
     camera = fit.camera
     if points.shape[:2] != (camera.height, camera.width):
         return False
@@ -132,7 +136,7 @@ def sample_pixels(points: F4, valid: Callable[[F4], Bool]) -> tuple[F8, F8, F8] 
 
 
 def _medians(a: F8, b: F8) -> tuple[F8, F8]:
-    """Summarize points by their medians in 16 bins of ``b``, which outliers cannot move far."""
+    """Return the medians of ``a`` and ``b`` in 16 bins of ``b``, which outliers hardly move."""
     groups = np.array_split(np.argsort(b, kind="stable"), 16)
     return (
         np.array([np.median(a[group]) for group in groups]),
@@ -141,7 +145,7 @@ def _medians(a: F8, b: F8) -> tuple[F8, F8]:
 
 
 def _line(a: F8, b: F8) -> tuple[float, float]:
-    """Fit ``b = slope * a + offset``."""
+    """Fit ``b = slope * a + offset`` by least squares; return slope and offset."""
     mean_a, mean_b = a.mean(), b.mean()
     spread = float(((a - mean_a) ** 2).sum())
     slope = float(((a - mean_a) * (b - mean_b)).sum() / spread) if spread > 0 else 0.0
@@ -153,18 +157,18 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
 
     Parameters
     ----------
-    rectified : whether the image is rectified: P describes rectified images, K and D the others.
-        If one of the two is zero, or the identity, the other one is used.
+    rectified : whether the images are rectified. P describes rectified images, K and D the others.
+        If the matrix to use (P or K) is zero or the identity, the other one is used.
 
     Returns
     -------
-    The camera after cropping and binning; and whether the image has lens distortion, which the
-    camera does not model.
+    The camera after cropping and binning, without lens distortion; and whether the images have
+    lens distortion.
 
     Raises
     ------
-    MessageError : a focal length is at most one pixel or beyond any camera's, or a value is not
-        finite.
+    MessageError : a focal length is at most 1 pixel, or an intrinsic parameter is not finite or
+        larger than 100 000 pixels.
     """
     k, p, d = (_field(info, name) for name in "kpd")
     use_p = p.size == 12 and p[0] > _UNIT and (rectified or k.size < 9 or k[0] in {0, _UNIT})
@@ -206,7 +210,7 @@ def is_rectified(topic: str) -> bool:
 
 
 def _field(info: Any, name: str) -> F8:
-    """Return a matrix by its ROS 2 name (lower case), or by its ROS 1 name (upper case)."""
+    """Return a matrix of a CameraInfo by its ROS 2 name (``k``), or its ROS 1 name (``K``)."""
     value = getattr(info, name, None)
     if value is None:
         value = getattr(info, name.upper())

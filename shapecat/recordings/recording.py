@@ -29,8 +29,8 @@ class Recording(ABC):
     path : the file or folder.
     topics : sorted by name; a topic with two types appears twice.
     start_ns, end_ns : log times of the first and last message; 0 if there is none.
-    closed : whether it was closed; then no messages can be read.
-    indexed : whether messages are found by topic and time, without reading the rest.
+    closed : whether the recording was closed; then no messages can be read.
+    indexed : whether messages can be found by topic and time, without reading the whole file.
     damaged : whether a damaged chunk, or a damaged index of one, was found in an MCAP file so far.
     warnings : problems found in the recording, for the user.
     frame_ids : frame ids found so far, by topic: a cache for the search for streams.
@@ -58,7 +58,7 @@ class Recording(ABC):
         return tuple(self._channels.values())
 
     def parts(self) -> list["Recording"]:
-        """Return one recording per file; a recording in a single file returns itself."""
+        """Return one recording per file; only this one if it is a single file."""
         return [self]
 
     def messages(
@@ -75,8 +75,8 @@ class Recording(ABC):
         topics : names to read; all by default.
         start_ns, stop_ns : messages with ``start_ns <= log time < stop_ns`` are read.
         needed : returns whether the data of a message is needed. Messages that are not needed may
-            come without data; those that damage has destroyed always do. Both are yielded, so that
-            frame numbers do not depend on what is needed.
+            be yielded without data. If ``needed`` is given, destroyed messages are yielded without
+            data, too, so that frame numbers do not depend on which messages are needed.
 
         Yields
         ------
@@ -85,8 +85,8 @@ class Recording(ABC):
 
         Raises
         ------
-        RecordingError : the disk cannot read the file, or the recording is closed, perhaps while
-            its messages are read.
+        RecordingError : the file cannot be read, or the recording is closed, even if that happens
+            between two messages.
         """
         self._require_open()
         with explained(f"{self.path}: cannot be read", RecordingError):
@@ -126,7 +126,7 @@ class Recording(ABC):
         return decode(message, self._decoders)
 
     def warn(self, text: str) -> None:
-        """Add a warning, unless it is there already or there are very many."""
+        """Add a warning for the user, unless it repeats one or there are 100 already."""
         if text not in self.warnings and len(self.warnings) <= _MOST_WARNINGS:
             enough = len(self.warnings) == _MOST_WARNINGS
             self.warnings.append("and more warnings" if enough else text)

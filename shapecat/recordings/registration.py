@@ -1,4 +1,7 @@
-"""Whether a colour image is registered to the depth image: compare the cameras of both."""
+"""Compare the intrinsics of a colour camera and a depth camera.
+
+Images of cameras with similar intrinsics and the same frame are registered pixel by pixel.
+"""
 
 from functools import lru_cache
 
@@ -15,32 +18,31 @@ _NEAR = 0.01
 _EQUAL = 1e-6
 """Intrinsics that differ by less than this fraction of the image width are equal."""
 _STRAIGHT_PX = 2.0
-"""A lens that moves no pixel of a grid farther than this leaves an image registered. Depth images
-with less distortion are likewise treated as those of a pinhole camera."""
+"""Images are treated as registered if the lens moves each pixel by less than this."""
 _STEPS = 9
-"""Rows and columns of that grid."""
+"""Rows and columns of the grid of pixels at which lens distortion is computed."""
 
 
 def are_similar(lens: LensCamera, camera: Camera | None) -> bool:
-    """Return whether the intrinsics of two cameras are similar; False without a camera."""
+    """Return whether the intrinsics of two cameras are similar; False if ``camera`` is None."""
     return _are_within(lens, camera, _NEAR)
 
 
 def are_equal(lens: LensCamera, camera: Camera | None) -> bool:
-    """Return whether the intrinsics of two cameras are equal; False without a camera."""
+    """Return whether the intrinsics of two cameras are equal; False if ``camera`` is None."""
     return _are_within(lens, camera, _EQUAL)
 
 
 def is_straight(lens: LensCamera, camera: Camera | None) -> bool:
-    """Return whether a lens moves no pixel of a pinhole camera by `_STRAIGHT_PX` or more.
+    """Return whether a lens moves each pixel of a pinhole camera by less than 2 pixels.
 
-    A lens without distortion counts as straight, and so does any lens if there is no camera.
+    The result is True if the lens has no distortion, or if ``camera`` is None.
     """
     return _bend_px(lens, camera) < _STRAIGHT_PX
 
 
 def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> bool:
-    """Return whether the intrinsics differ by less than a fraction of the image width."""
+    """Return whether intrinsics differ by less than ``fraction`` of the image width in pixels."""
     if camera is None:
         return False
     intrinsics, camera_intrinsics = ((c.fx, c.fy, c.cx, c.cy) for c in (lens.pinhole, camera))
@@ -50,7 +52,7 @@ def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> boo
 
 @lru_cache(maxsize=8)
 def _bend_px(lens: LensCamera, camera: Camera | None) -> float:
-    """Return the largest distance (px) from a pixel of `camera` to where `lens` sees its ray."""
+    """Return how far (px) the lens moves the pixels of a pinhole camera: the largest distance."""
     if camera is None or not lens.model:
         return 0.0
     pinhole = lens.pinhole

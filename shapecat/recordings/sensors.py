@@ -1,4 +1,4 @@
-"""Depth streams, and which of them come from the same sensor."""
+"""Depth streams, and how to group them by sensor."""
 
 import re
 from collections.abc import Sequence
@@ -9,22 +9,25 @@ from typing import Literal, NamedTuple
 __all__ = ["Stream", "by_sensor", "is_of_realsense_recorder", "same_frame"]
 
 _KINDS = ("depth", "points", "cloud", "image", "aligned")
-"""The first part of a topic with one of these words ends the namespace of the sensor."""
+"""The namespace of a sensor ends before the first component of a topic with one of these words."""
 _PLAIN = {
     *("aligned", "color", "colour", "depth", "hw", "image", "raw", "rect", "rectified"),
     *("registered", "rgb", "sw", "cloud", "point", "pointcloud", "points"),
 }
-"""Words between that namespace and the name of the topic that do not name a camera."""
+"""Words between that namespace and the topic's own name that do not tell cameras apart."""
 
 
 @dataclass(frozen=True)
 class Stream:
     """A topic of depth images or clouds.
 
-    ``info_topic`` is the topic of a depth image's calibration, None if there is none; ``count`` is
-    the number of messages; ``frame_id`` is from the first message; ``doubt`` says why its frames
-    may be wrong, for example with the calibration of another camera; it is empty if there is no
-    doubt.
+    Attributes
+    ----------
+    info_topic : topic of the calibration of depth images; None if there is none.
+    count : number of messages.
+    frame_id : frame of the first message.
+    doubt : why the frames may be wrong, for example because the calibration seems to be that of
+        another camera; empty if there is no doubt.
     """
 
     topic: str
@@ -37,12 +40,19 @@ class Stream:
 
     @property
     def usable(self) -> bool:
-        """Whether the stream gives frames: depth images need a calibration."""
+        """Whether the stream can be processed: depth images need a calibration."""
         return self.kind == "points" or self.info_topic is not None
 
 
 class _Place(NamedTuple):
-    """The parts of a topic: the sensor's namespace, the rest, and words that name a camera."""
+    """The components of a topic.
+
+    Attributes
+    ----------
+    space : the namespace of the sensor.
+    rest : the components after it.
+    camera : words in these that tell cameras apart.
+    """
 
     space: tuple[str, ...]
     rest: tuple[str, ...]
@@ -55,18 +65,18 @@ def same_frame(a: str, b: str) -> bool:
 
 
 def is_of_realsense_recorder(topic: str) -> bool:
-    """Return whether librealsense recorded a topic itself: its frame ids are numbers, not names."""
+    """Return whether librealsense recorded a topic itself; its frame ids are then only numbers."""
     return topic.startswith("/device_")
 
 
 def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
     """Group streams by sensor.
 
-    Streams belong to the same sensor if they share the sensor's namespace (``/camera/depth/points``
-    and ``/camera/aligned_depth_to_color/image_raw``), unless the rest of their names tells
-    different cameras apart (``/spot/depth/left/image`` and ``/spot/depth/right/image``), or if they
-    share a frame, unless the same driver seems to run in both namespaces, as on two robots of one
-    kind.
+    Streams with the same namespace (``/camera/depth/points`` and
+    ``/camera/aligned_depth_to_color/image_raw``) belong to the same sensor, unless the rest of
+    their names tells cameras apart (``/spot/depth/left/image`` and ``/spot/depth/right/image``).
+    Streams with the same frame belong to the same sensor, unless the same driver seems to run in
+    both namespaces, as on two robots of the same kind.
     """
     places = {stream.topic: _place(stream.topic) for stream in streams}
     twins = {
@@ -107,11 +117,12 @@ def _share_namespace(a: _Place, b: _Place) -> bool:
 
 
 def _are_twins(a: Stream, b: Stream, first: _Place, second: _Place) -> bool:
-    """Return whether the same topic of a driver is in two namespaces, each with its calibration.
+    """Return whether two instances of a driver, in two namespaces, seem to publish two streams.
 
-    Namespaces with the same first part (``/kinect2/hd``, ``/kinect2/qhd``) belong to one driver,
-    and a namespace put before another, as for throttled topics, holds a copy. Clouds have no
-    calibration, so the last two parts of their topics are compared.
+    Their topics are then the same after the namespace, but have different calibrations. Clouds have
+    no calibration, so the last two components of their topics are compared instead. Two namespaces
+    with the same first component (``/kinect2/hd``, ``/kinect2/qhd``) belong to one driver. If one
+    namespace ends in the other, it holds a copy, such as throttled topics.
     """
     short, long = sorted((first.space, second.space), key=len)
     copied = first.space[:1] == second.space[:1] or long[len(long) - len(short) :] == short

@@ -36,37 +36,37 @@ __all__ = ["SOURCES", "DepthSource", "PointsSource", "Source"]
 
 
 class Source:
-    """A stream and its state between frames; ``skipped`` counts unreadable messages by reason."""
+    """Converts the messages of a depth stream to frames, one after the other."""
 
     def __init__(self, recording: Recording, stream: Stream, skipped: Counter[str]) -> None:
-        """Start before the first message; ``skipped`` is updated in place."""
+        """Start without messages; ``skipped`` will count unreadable messages by reason."""
         self.recording = recording
         self.stream = stream
         self.skipped = skipped
         self.clock = Clock(recording, stream.topic)
 
     def read(self, message: Message, index: int) -> Iterator[Frame]:
-        """Yield the frames that message ``index`` completes: its own, an earlier one, or none."""
+        """Yield the frames that message ``index`` completes: its own, the previous one, or both."""
         raise NotImplementedError
 
     def finish(self) -> Iterator[Frame]:
-        """Yield the frame that is held back, if any."""
+        """Yield the frame that was held back until the end of the recording, if any."""
         yield from ()
 
     @contextmanager
     def counting(self) -> Iterator[None]:
-        """Count an unreadable message by its reason instead of raising."""
+        """In the block, count errors of unreadable messages by reason instead of raising them."""
         try:
             yield
         except (MessageError, *MALFORMED) as error:
             self.skipped[reason_of(error, self.stream.topic)] += 1
 
     def frame(self, message: Message, index: int, header: Any, content: dict[str, Any]) -> Frame:
-        """Return a frame of ``content``: depth and camera, or points.
+        """Return a frame with the given ``content``: depth and camera, or points.
 
         Raises
         ------
-        MessageError : the log time is not within 0 to 2**63 - 1 ns.
+        MessageError : the stamp or the log time is not within 0 to 2**63 - 1 ns.
         """
         if not 0 <= message.log_time_ns < 2**63:
             msg = "log time out of range"
@@ -120,12 +120,12 @@ class PointsSource(Source):
 
 
 def _placed(points: F4, pose: Pose | None) -> F4:
-    """Transform a cloud (h, w, 3) that has its own pose into the sensor frame."""
+    """Transform a cloud (h, w, 3) by its own pose, if any, to the frame that it names."""
     return points if pose is None else transform(pose, points).astype(np.float32)
 
 
 class DepthSource(Source):
-    """A stream of depth images; each waits for the calibration with its stamp."""
+    """A stream of depth images. Each image waits for the calibration with the same stamp."""
 
     def __init__(self, recording: Recording, stream: Stream, skipped: Counter[str]) -> None:
         """Start without a calibration."""
@@ -197,12 +197,12 @@ class DepthSource(Source):
         camera, distorted = camera_of_info(self._info, rectified=self.rectified)
         compressed = ros_counterpart(self.stream.type) == COMPRESSED
         depth = depth_of_compressed(image) if compressed else depth_of_image(image, self.units)
-        if camera.width == camera.height == 0:  # drivers may leave out the size alone
+        if camera.width == camera.height == 0:  # some drivers leave out the size
             camera = replace(camera, height=depth.shape[0], width=depth.shape[1])
         if depth.shape != (camera.height, camera.width):
             shape = f"{depth.shape[1]} x {depth.shape[0]}"
             size = f"{camera.width} x {camera.height}"
-            # After a count, which may be 1.
+            # The report puts a count before this: "3 with depth of ...".
             msg = f"with depth of {shape} but CameraInfo for {size} on {self.info_topic}"
             raise MessageError(msg)
         if off_center(camera) and not self._info.roi.width:
@@ -217,7 +217,7 @@ class DepthSource(Source):
 
 
 def _depth_units(recording: Recording, topic: str) -> float | None:
-    """Return the depth units per metre that the RealSense viewer recorded; None if it did not."""
+    """Return the depth units per metre in a recording of the RealSense viewer; None otherwise."""
     sensor = "/".join(topic.split("/")[:3])
     for candidate in recording.topics:
         name = candidate.name.replace(" ", "_")

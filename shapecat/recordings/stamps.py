@@ -1,4 +1,4 @@
-"""Stamps of messages, and checks for unreliable clocks."""
+"""Read the stamps of messages, and warn about unreliable clocks."""
 
 from contextlib import suppress
 from functools import cached_property
@@ -13,9 +13,9 @@ __all__ = ["Clock", "delay_ns", "stamp_ns"]
 _EPOCH_NS = 946_684_800 * 10**9
 """1 January 2000: earlier stamps probably count from when the sensor was switched on."""
 _JUMP_NS = 10 * 10**9
-"""A larger change of the delay between stamp and log time counts as a jump."""
+"""Smallest change of the delay between stamp and log time that counts as a jump."""
 _FIRST = 5
-"""Number of messages in which a stamp is sought that is not 0."""
+"""Number of messages that `delay_ns` searches for a stamp other than 0."""
 
 
 def stamp_ns(header: Any) -> int:
@@ -33,10 +33,11 @@ def stamp_ns(header: Any) -> int:
 
 
 def delay_ns(recording: Recording, topic: str) -> int:
-    """Return the log time minus the stamp (ns) of the first message on a topic with a stamp.
+    """Return log time minus stamp (ns) for the first message of a topic with a stamp other than 0.
 
-    Where a stamp is 0, the log time less this delay is in the same clock as the other stamps, which
-    may count from the start of a simulation. Returns 0 if none of the first messages has a stamp.
+    A missing stamp can be estimated as the log time minus this delay. That works for any clock,
+    such as one that counts from the start of a simulation. The delay is 0 if the stamps of the
+    first messages are all 0.
     """
     for message in islice(recording.messages([topic]), _FIRST):
         with suppress(MessageError, *MALFORMED):
@@ -50,14 +51,17 @@ class Clock:
     """Replaces missing stamps on one topic, and counts suspicious ones."""
 
     def __init__(self, recording: Recording, topic: str) -> None:
-        """Start before the first stamp of a topic."""
+        """Prepare to check the stamps of a topic; `report` adds warnings to ``recording``."""
         self.recording, self.topic = recording, topic
         self.last: int | None = None
         self.delay: int | None = None
         self.counts = dict.fromkeys(_TEXTS, 0)
 
     def check(self, stamp: int, log_time: int) -> int:
-        """Return a stamp; if it is 0, the log time less the `delay_ns` of the topic. All in ns."""
+        """Return the stamp of the next message, or an estimate if it is 0; count suspicious stamps.
+
+        The estimate is the log time minus the `delay_ns` of the topic. All times are nanoseconds.
+        """
         if stamp == 0:
             self.counts["zero"] += 1
             return max(log_time - self._delay_ns, 0)

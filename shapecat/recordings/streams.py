@@ -35,21 +35,21 @@ INFO = "sensor_msgs/msg/CameraInfo"
 _PEEK = 5
 """Number of messages tried to classify a topic: the first may be damaged or blank."""
 _WARNINGS = 3
-"""Warnings about a recording that an error repeats."""
+"""Maximum number of warnings about the recording in an error message."""
 _UNREADABLE = "no readable messages"
 _NO_INFO_REMEDY = "record the camera_info topic, or use a PointCloud2"
 _OTHER_WORDS = (
     *("amplitude", "confidence", "disparity", "intensity", "mask", "snr", "statemap", "texture"),
     "thermal",
 )
-"""Images on topics with these words, encoded like depth, are something else."""
+"""Images on topics with these words are not depth images, even if they are encoded like these."""
 _AXES = {"x", "y", "z"}
 
 
 def depth_streams(recording: Recording, requested: Sequence[str] = ()) -> tuple[Stream, ...]:
     """Find the clouds and depth images of a recording, sorted by topic.
 
-    The encoding of the first images, of which some may be blank, distinguishes depth from colour.
+    The encoding of the first few images, which may be blank, distinguishes depth from colour.
     Topics named after other images, such as confidence or disparity, are left out unless they are
     ``requested``, with or without a leading slash. A depth image is paired with the calibration in
     its own namespace (``depth/image_raw`` with ``depth/camera_info``), or with the only one in the
@@ -125,7 +125,7 @@ def _select(
 
 
 def _why_unusable(recording: Recording, streams: tuple[Stream, ...], name: str) -> str:
-    """Return the error for a requested topic that is missing or holds no depth."""
+    """Return the error message for a requested topic that is missing or holds no depth."""
     usable = listed([stream.topic for stream in streams]) or "none"
     topics = [t for t in recording.topics if t.name.strip("/") == name.strip("/")]
     details = [detail for topic in topics if (detail := _encoding_or_error(recording, topic))]
@@ -139,6 +139,7 @@ def _why_unusable(recording: Recording, streams: tuple[Stream, ...], name: str) 
 
 
 def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
+    """Return the error message for a recording without usable streams."""
     if streams:
         names = listed([stream.topic for stream in streams])
         problem = f"depth images without a sensor_msgs/CameraInfo: {names}; {_NO_INFO_REMEDY}"
@@ -190,7 +191,7 @@ def _image_name(topic: str) -> str:
 
 
 def _is_other(topic: Topic) -> bool:
-    """Return whether an image topic is named after something other than depth."""
+    """Return whether the name of an image topic says that it holds something other than depth."""
     name = _own_name(topic.name)
     return ros_counterpart(topic.type) != CLOUD and any(word in name for word in _OTHER_WORDS)
 
@@ -201,13 +202,13 @@ def _is_infrared(topic: str) -> bool:
 
 
 def _is_radial(topic: str) -> bool:
-    """Return whether a topic is named after distances that are not to the image plane."""
+    """Return whether a topic's name suggests distances along the rays instead of depths."""
     name = _own_name(topic)
     return "distance" in name and "plane" not in name
 
 
 def _own_name(topic: str) -> str:
-    """Return the end of an image topic: the part after ``depth``, without robot and camera."""
+    """Return the last two components of an image topic, or what follows ``depth`` in them."""
     return "/".join(_image_name(topic).split("/")[-2:]).rpartition("depth")[2]
 
 
@@ -217,9 +218,9 @@ def first_message(recording: Recording, topic: str) -> Any:
 
 
 def first_messages(recording: Recording, topic: str, kind: str | None = None) -> Iterator[Any]:
-    """Yield the messages, among a topic's first few, that can be decoded.
+    """Yield those of a topic's first few messages that can be decoded.
 
-    With ``kind``, messages of other types are left out.
+    ``kind`` is the type of these messages; None for any type.
     """
     of_type = (m for m in recording.messages([topic]) if kind is None or m.type == kind)
     for message in islice(of_type, _PEEK):
@@ -281,10 +282,11 @@ def _depth_stream(topic: Topic, first: Any, recording: Recording) -> Stream:
 def info_topic_of(image: str, recording: Recording, frame_id: str) -> str | None:
     """Return the calibration topic that shares the longest namespace with an image topic.
 
-    That may be the image topic itself (``depth`` with ``depth/camera_info``), as in AirSim. Within
-    a namespace, one with a word of the image topic (``depth_image`` with ``depth_camera_info``)
-    comes first. Without a common namespace it is the only calibration of the images' frame
-    ``frame_id``, or the only one in the recording; otherwise None.
+    The image topic itself may be that namespace (``depth`` with ``depth/camera_info``), as in
+    AirSim. Within a namespace, a calibration topic with a word of the image topic is preferred
+    (``depth_image`` with ``depth_camera_info``). If none shares a namespace, the result is the only
+    calibration in the recording, or the only one for ``frame_id``, the frame of the images; else
+    None.
     """
     infos = [
         topic.name
@@ -300,7 +302,7 @@ def info_topic_of(image: str, recording: Recording, frame_id: str) -> str | None
 
 
 def _nearest(image: str, infos: Sequence[str]) -> str | None:
-    """Return the calibration topic that shares the longest namespace with an image topic."""
+    """Return the topic in ``infos`` with the longest namespace of an image topic; None if none."""
     parts = image.split("/")
     outermost = 2 if image.startswith("/") else 1  # the first part of /depth/image is empty
     for length in range(len(parts), min(len(parts) - 1, outermost) - 1, -1):
@@ -314,7 +316,7 @@ def _nearest(image: str, infos: Sequence[str]) -> str | None:
 
 
 def _frame_of(recording: Recording, topic: str) -> str:
-    """Return the frame id of a topic's first message, read once; empty if it has none."""
+    """Return the frame id of a topic's first message, which is read once; empty if it has none."""
     if topic not in recording.frame_ids:
         recording.frame_ids[topic] = ""
         with suppress(*MALFORMED):  # or no message

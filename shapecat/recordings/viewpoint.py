@@ -1,4 +1,4 @@
-"""The viewpoint of an organized cloud that was transformed, as into a robot's base frame."""
+"""Find the camera pose of an organized cloud that was transformed, as to a robot's base frame."""
 
 import numpy as np
 
@@ -10,10 +10,10 @@ from shapecat.types import Pose
 __all__ = ["find_viewpoint", "seen_from"]
 
 _LONGEST = 10
-"""Maximum focal length in image widths; that of a height map, which no camera sees, is larger."""
+"""Maximum focal length in image widths. A larger one fits a height map, which no camera took."""
 _CLEAR = 1e-4
-"""The squared residual is at most this fraction of the next singular value, squared. For the points
-of a single plane, any of many cameras fits, and both are equal."""
+"""Maximum squared ratio of the two smallest singular values of the equations. It is near 1 for the
+points of a single plane, which many cameras fit."""
 _ROUNDS = 3
 
 
@@ -60,9 +60,10 @@ def find_viewpoint(points: F4, previous: PinholeFit | None) -> tuple[PinholeFit,
 
 
 def seen_from(pose: Pose, points: F4) -> F4:
-    """Transform a cloud (h, w, 3) into the frame of its camera; NaN where depth is missing.
+    """Transform a cloud (h, w, 3) to the frame of its camera, whose pose is ``frame_from_camera``.
 
-    ``pose`` is ``frame_from_camera``. Invalid points may have become the camera's centre.
+    Its z is NaN where depth is missing: at points that are NaN, behind or very near the camera, or
+    at the origin of either frame, since drivers mark missing points by the origin.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         image = (points - pose.translation.astype(np.float32)) @ pose.rotation.astype(np.float32)
@@ -73,9 +74,12 @@ def seen_from(pose: Pose, points: F4) -> F4:
 
 
 def _projection_matrix(places: F8, pixels: F8) -> tuple[F8, float]:
-    """Return the matrix (3, 4) that projects places (n, 4) to pixels (n, 2), and how unclear it is.
+    """Fit the projection of homogeneous points (n, 4) to pixels (n, 2).
 
-    That is the squared ratio of the two smallest singular values of the equations.
+    Returns
+    -------
+    The matrix (3, 4), and the squared ratio of the two smallest singular values of the equations,
+    which is small if the points determine the matrix.
     """
     zero = np.zeros_like(places)
     rows = np.vstack(
@@ -89,6 +93,6 @@ def _projection_matrix(places: F8, pixels: F8) -> tuple[F8, float]:
 
 
 def _rq_rotation(linear: F8) -> F8:
-    """Return the rotation R of a matrix (3, 3) that is an upper triangular one times R."""
+    """Return the rotation in the RQ decomposition of a matrix (3, 3): upper triangle times it."""
     rows, triangle = np.linalg.qr(linear[::-1].T)
     return np.asarray(rows.T[::-1] * np.sign(np.diag(triangle)[::-1, None]))

@@ -1,4 +1,4 @@
-"""Recordings in one file of chunks: read by time if it is indexed, otherwise in file order."""
+"""Read a file that consists of chunks: by time if it is indexed, otherwise in file order."""
 
 from abc import abstractmethod
 from collections import Counter
@@ -14,7 +14,7 @@ from shapecat.recordings.recording import Recording
 __all__ = ["Chunk", "ChunkedRecording", "RawMessage", "in_time_order"]
 
 _PENDING = 512 << 20
-"""Once this many bytes of messages are held back, no further chunk is read ahead."""
+"""Maximum size of the messages held back; with more, no further chunk is read ahead. Bytes."""
 
 
 class RawMessage(NamedTuple):
@@ -35,7 +35,7 @@ class Chunk(NamedTuple):
     start, end : log times of its first and last message, nanoseconds.
     position : offset in the file, bytes.
     channel_ids : the channels of its messages; empty if the index does not list them.
-    entry : the entry of the index, in the terms of the format.
+    entry : the index entry of the chunk, whose type depends on the format.
     """
 
     start: int
@@ -45,7 +45,7 @@ class Chunk(NamedTuple):
     entry: Any
 
     def overlaps(self, channel_ids: set[int], selection: Selection) -> bool:
-        """Return whether the chunk may hold messages of these channels in the selected time."""
+        """Return whether the chunk may hold messages of these channels in the selected period."""
         return (
             (selection.start_ns is None or self.end >= selection.start_ns)
             and (selection.stop_ns is None or self.start < selection.stop_ns)
@@ -93,11 +93,11 @@ class ChunkedRecording(Recording):
 
     @abstractmethod
     def _read_index(self) -> bool:
-        """Read channels, counts, and chunks with messages; return False without a usable index."""
+        """Store channels, counts and chunks from the index; return False if it is not usable."""
 
     @abstractmethod
     def _record_at(self, position: int) -> Any:
-        """Return the record at a byte offset, None if there is no whole one."""
+        """Return the record at a byte offset; None if it is damaged or truncated."""
 
     @abstractmethod
     def _records(self) -> Iterator[Any]:
@@ -105,7 +105,7 @@ class ChunkedRecording(Recording):
 
     @abstractmethod
     def _expand(self, record: Any) -> Iterator[RawMessage]:
-        """Yield the messages of a record; without an index, store new channels."""
+        """Yield the messages of a record; store its channels if the file has no index."""
 
     @abstractmethod
     def _read_chunk(
@@ -117,7 +117,7 @@ class ChunkedRecording(Recording):
         self._channels = {}
 
     def _agrees(self) -> bool:
-        """Return whether the index describes the channels as the chunks do."""
+        """Return whether the channels in the index are equal to those in the chunks."""
         indexed, warnings = self._channels, list(self.warnings)
         self._forget_channels()
         unseen = set(indexed)
@@ -179,8 +179,8 @@ def in_time_order(
 ) -> Iterator[RawMessage]:
     """Yield the messages of all chunks by time, in file order if times are equal.
 
-    While more than `_PENDING` bytes are held back no further chunk is read: then the messages of
-    overlapping chunks may come out of order.
+    While more than 512 MiB of messages are held back, no further chunk is read; messages of
+    overlapping chunks may then come out of order.
 
     Parameters
     ----------

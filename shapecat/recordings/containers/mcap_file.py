@@ -46,9 +46,9 @@ class McapRecording(ChunkedRecording):
 
     Attributes
     ----------
-    indexed : the file is finished, and its index is complete.
-    summary : schemas, channels and indexes, of a file that is ``indexed``.
-    profile : ``ros2``, ``ros1`` or empty.
+    indexed : whether the file is finished, and its index is complete.
+    summary : schemas, channels and indexes; use it only if the file is ``indexed``.
+    profile : profile in the header, such as ``ros2`` or ``ros1``; may be empty.
     """
 
     kind: ClassVar[str] = "mcap"
@@ -144,7 +144,7 @@ class McapRecording(ChunkedRecording):
         return last
 
     def _records(self) -> Iterator[Record]:
-        """Yield the records up to the end of the data; a truncated chunk is cut."""
+        """Yield the records up to the end of the data, including a truncated chunk."""
         try:
             for record in walk(self._file, len(MAGIC), self._size):
                 yield record
@@ -167,7 +167,7 @@ class McapRecording(ChunkedRecording):
                 self.warn(f"skipped a record at byte {record.offset}: {error}")
 
     def _split(self, record: Record, end: int | None = None) -> Iterator[RawMessage]:
-        """Yield the messages of a chunk up to its end, its truncation, or the byte ``end``."""
+        """Yield the messages of a chunk, up to its byte ``end`` or to where it is truncated."""
         try:
             for opcode, content in split_chunk(self._plain(record, end)):
                 yield from self._take(opcode, content)
@@ -209,11 +209,11 @@ class McapRecording(ChunkedRecording):
     def _read_chunk(
         self, chunk: Chunk, channel_ids: set[int], selection: Selection
     ) -> Iterator[RawMessage]:
-        """Yield the messages of a chunk; those after the last needed one have no data.
+        """Yield the messages of a chunk, at least up to the last needed one.
 
-        Reading only transforms, or few images of many, then decompresses little. If messages are
-        chosen by ``needed``, those that damage has destroyed have no data either: a frame has the
-        same number whether the chunk was read or not.
+        The rest is not decompressed unless it is short: often only transforms or a few images are
+        needed. If the selection has ``needed``, all messages that were not read, or that damage has
+        destroyed, follow without data, so that frames have the same numbers whatever is needed.
         """
 
         def is_needed(message: IndexedMessage) -> bool:
@@ -259,6 +259,6 @@ class McapRecording(ChunkedRecording):
 
 _NONE = ("", "", b"")
 _KNOWN = {int(opcode) for opcode in Opcode} | set(range(128, 256))
-"""Opcodes that cause no warning; 128 to 255 are for private use."""
+"""Opcodes that cause no warning. The MCAP specification leaves 128 to 255 to applications."""
 _END = (Opcode.DATA_END, Opcode.FOOTER)
 _DEFINING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)

@@ -1,4 +1,4 @@
-"""The index of the messages in each chunk of an MCAP file."""
+"""Read the index of the messages in a chunk of an MCAP file."""
 
 import struct
 from itertools import chain
@@ -12,7 +12,7 @@ __all__ = ["IndexedMessage", "read_message_index"]
 
 _HEAD = struct.Struct("<HI")
 _ENTRY = struct.Struct("<QQ")
-"""Head of a message index: channel and bytes of entries. An entry: log time and offset."""
+"""Head of a message index: channel id and bytes of all entries. An entry: log time and offset."""
 
 
 class IndexedMessage(NamedTuple):
@@ -26,7 +26,7 @@ class IndexedMessage(NamedTuple):
 def read_message_index(file: BinaryIO, chunk: records.ChunkIndex) -> list[IndexedMessage]:
     """Return the index entries of a chunk; empty if one is damaged or a channel is missing.
 
-    The entries have no checksum: they must lie within the time and the size of the chunk.
+    Entries have no checksum. One counts as damaged if its time or offset lies outside the chunk.
     """
     begin = chunk.chunk_start_offset + chunk.chunk_length
     entries_of: dict[int, list[IndexedMessage]] = {}

@@ -39,9 +39,9 @@ _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
 _MESSAGE = struct.Struct("<HIQQ")
 _FREELY = 256 << 20
-"""A chunk may always claim this decompressed size, bytes."""
+"""A chunk may claim a decompressed size of up to this many bytes, whatever its compressed size."""
 _RATIO = 1000
-"""A larger chunk may claim up to this multiple of its compressed size."""
+"""A chunk may also claim a decompressed size of up to this multiple of its compressed size."""
 
 _T = TypeVar("_T")
 
@@ -63,7 +63,7 @@ class ChunkError(RecordingError):
 
 
 class Record(NamedTuple):
-    """Opcode of a record, offset and length of its content in bytes, and whether it is whole."""
+    """Opcode of a record, offset and length of its content in bytes; ``whole`` if not truncated."""
 
     opcode: int
     offset: int
@@ -118,7 +118,7 @@ def read_chunk(content: bytes, *, end: int | None = None, checked: bool = False)
     ----------
     end : decompress at most this many bytes, and do not verify the chunk; None to decompress and
         verify all of it.
-    checked : whether the checksum has been verified before.
+    checked : whether the checksum was verified earlier, so that it need not be verified again.
 
     Raises
     ------
@@ -191,11 +191,11 @@ def _zstd_part(data: memoryview, size: int) -> bytes:
 
 
 _DECOMPRESS_PART = _DECOMPRESS | {"zstd": _zstd_part}
-"""Decompressors for truncated data; LZ4 returns what it can anyway."""
+"""Decompressors that also accept truncated data, as those for LZ4 always do."""
 
 
 def split_chunk(chunk: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """Yield opcode and content of each record in a chunk.
+    """Yield the opcode and the content of each record in a decompressed chunk.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The summary section of an MCAP file, as far as it can be trusted."""
+"""Read and check the summary section of an MCAP file."""
 
 import zlib
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from shapecat.recordings.containers.mcap_records import (
 __all__ = ["DAMAGED_INDEX", "Summary", "read_summary"]
 
 DAMAGED_INDEX = "the index is damaged: reading the file from beginning to end instead"
-"""A warning."""
+"""A warning for the user."""
 
 _FOOTER = 9 + 20
 
@@ -29,8 +29,8 @@ _FOOTER = 9 + 20
 class Summary:
     """The summary of a file.
 
-    ``data_end`` is the byte offset at which the data ends; ``checked`` says whether the summary has
-    a checksum, which was verified.
+    ``data_end`` is the byte offset at which the data ends; ``checked`` says whether the checksum of
+    the summary was verified, and is False if it has none.
     """
 
     schemas: dict[int, records.Schema] = field(default_factory=dict)
@@ -108,7 +108,7 @@ def _collect(file: BinaryIO, start: int, end: int) -> Summary:
 
 
 def _find_data_end(file: BinaryIO, summary: Summary, summary_start: int) -> int:
-    """Return the offset of the data end record, found from the last indexed record onwards."""
+    """Return the offset of the data end record; the search starts after the last indexed record."""
     ends = [c.chunk_start_offset + c.chunk_length for c in summary.chunks]
     ends += [item.offset + item.length for item in (*summary.attachments, *summary.metadata)]
     for record in walk(file, max(ends, default=len(MAGIC)), summary_start):

@@ -1,4 +1,4 @@
-"""Messages that rosbag2 compressed one by one (``--compression-mode message``)."""
+"""Decompress messages that rosbag2 compressed one by one (``--compression-mode message``)."""
 
 import zstandard
 
@@ -10,7 +10,7 @@ __all__ = ["decompressed"]
 _ZSTD = b"\x28\xb5\x2f\xfd"
 """First bytes of a compressed message; a CDR message begins with a zero byte."""
 _LARGEST = 1 << 30
-"""Compressed messages that claim a larger decompressed size, in bytes, are skipped."""
+"""Largest size, in bytes, that a compressed message may claim for its data."""
 
 
 def decompressed(

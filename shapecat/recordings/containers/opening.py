@@ -14,7 +14,7 @@ __all__ = ["open_recording"]
 def open_recording(path: Path) -> Recording:
     """Open an MCAP file, a ROS 1 bag, or a ROS 2 bag (a .db3 file or a folder).
 
-    The first bytes of a file determine its format, not its name.
+    The first bytes of a file, not its name, determine its format.
 
     Raises
     ------

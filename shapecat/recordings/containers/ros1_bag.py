@@ -35,7 +35,7 @@ __all__ = ["BagRecording"]
 
 
 class BagRecording(ChunkedRecording):
-    """A ROS 1 bag; the log time of a message is when it was recorded.
+    """A ROS 1 bag. The log time of a message is the time at which it was recorded.
 
     Raises `RecordingError` if the file is not version 2.0, is encrypted, or holds no topics.
     """
@@ -101,7 +101,7 @@ class BagRecording(ChunkedRecording):
         return None
 
     def _chunk_info(self, record: Record) -> Chunk:
-        """Return a chunk whose entry is its number of messages on each connection."""
+        """Return the described chunk; its ``entry`` is the number of messages by connection id."""
         counts = dict(struct.iter_unpack("<II", self._data(record)))
         start, end = (time_of(record.fields, name) for name in ("start_time", "end_time"))
         return Chunk(start, end, u8(record.fields, "chunk_pos"), counts.keys(), counts)
@@ -117,7 +117,7 @@ class BagRecording(ChunkedRecording):
     def _records(self) -> Iterator[Record]:
         """Yield the records in file order; a truncated one is cut to its readable part.
 
-        After a damaged record, the next chunk in the index is read.
+        After a damaged record, reading continues at the next chunk in the index.
         """
         for start, end in pairwise([self._first, *self._places, self._size]):
             try:
@@ -129,10 +129,10 @@ class BagRecording(ChunkedRecording):
                     yield error.record
 
     def _expand(self, record: Record | None, listed: int | None = None) -> Iterator[RawMessage]:
-        """Yield the messages of a record; store new connections.
+        """Yield the messages of a record; store its connections if the file has no index.
 
-        A truncated chunk is read as far as possible. A chunk causes a warning if its number of
-        messages differs from that ``listed`` in the index.
+        A truncated chunk is read as far as possible. ``listed`` is the number of messages that the
+        index lists for a chunk: if they are not as many, there is a warning. None skips this check.
         """
         if record is None or record.op not in {CHUNK, CONNECTION}:
             return

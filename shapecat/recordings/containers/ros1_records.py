@@ -39,9 +39,9 @@ _LONG = struct.Struct("<Q")
 _TIME = struct.Struct("<II")
 _LONGEST_HEADER = 1 << 20
 _FREELY = 256 << 20
-"""A chunk may always have this decompressed size, bytes."""
+"""A chunk may have up to this many bytes decompressed, whatever its compressed size."""
 _RATIO = 1000
-"""A larger chunk may have up to this multiple of its compressed size."""
+"""A chunk may also have up to this multiple of its compressed size."""
 
 
 class BagError(RecordingError):
@@ -165,7 +165,7 @@ def _length(data: bytes) -> int | None:
 
 
 def split(chunk: memoryview) -> Iterator[tuple[dict[str, bytes], memoryview]]:
-    """Yield header and data of each record in a chunk.
+    """Yield the header fields and the data of each record in a decompressed chunk.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def expand(record: Record, data: bytes) -> tuple[memoryview, str]:
 
     Returns
     -------
-    The decompressed data, and the reason why the rest is missing; empty if the chunk is complete.
+    The decompressed data, and the reason why some is missing; empty if the chunk is complete.
     """
     method = record.fields.get("compression", b"").decode("latin-1")
     if method == "none":

@@ -1,4 +1,4 @@
-"""ROS 2 bags in one SQLite file (.db3)."""
+"""Read ROS 2 bags in one SQLite file (.db3)."""
 
 import shutil
 from collections.abc import Iterator
@@ -32,12 +32,12 @@ _UNREADABLE = (ReaderError, apsw.Error, OSError, *LIBRARY_ERRORS)
 _LAST_NS = 2**63 - 1
 """The largest time that SQLite can hold."""
 _OF_URLS = frozenset("%?#")
-"""In a path, the reader interprets these characters as those of a URL."""
+"""Characters in a path that the reader would interpret as parts of a URL."""
 _SCHEMAS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
 
 
 class DatabaseRecording(Recording):
-    """A ROS 2 bag in SQLite; the log time of a message is when it was recorded."""
+    """A ROS 2 bag in SQLite. The log time of a message is the time at which it was recorded."""
 
     kind: ClassVar[str] = "ros2"
 
@@ -76,7 +76,7 @@ class DatabaseRecording(Recording):
         self._cleanup.close()
 
     def _with_log(self) -> Path:
-        """Return the database, or a copy with the messages of a killed recorder's write-ahead log.
+        """Return the database, or a copy that includes the write-ahead log of a killed recorder.
 
         The copy and its log use at most half of the free space of the temporary folder.
         """
@@ -87,7 +87,8 @@ class DatabaseRecording(Recording):
             folder = self._cleanup.enter_context(scratch_folder())
             copy = folder / "a.db3"
             room = shutil.disk_usage(folder).free // 2
-            if self.path.stat().st_size + 2 * log.stat().st_size > room:  # which is merged in
+            # The log is copied, then merged into the database.
+            if self.path.stat().st_size + 2 * log.stat().st_size > room:
                 msg = "not enough space in the temporary folder to copy it"
                 raise OSError(msg)  # noqa: TRY301  handled like a full disk
             shutil.copyfile(self.path, copy)
@@ -101,7 +102,7 @@ class DatabaseRecording(Recording):
         return copy
 
     def _renamed(self) -> Path:
-        """Return the database, or a link with a name that the reader accepts."""
+        """Return the database, or a link to it with a name that the reader accepts."""
         if self.path.suffix == ".db3" and _OF_URLS.isdisjoint(str(self.path)):
             return self.path
         link = self._cleanup.enter_context(scratch_folder()) / "a.db3"
@@ -133,7 +134,7 @@ class DatabaseRecording(Recording):
     def _rows(
         self, connections: list[Any], times: list[int | None]
     ) -> Iterator[tuple[int, Any, Any]]:
-        """Yield channel number, time and data of any type; the data is None if it is damaged."""
+        """Yield channel id, time (ns) and data of each message; the data is None if damaged."""
         count = 0
         try:
             for connection, time, data in self._reader.messages(connections, *times):
@@ -150,7 +151,7 @@ class DatabaseRecording(Recording):
     def _single_rows(
         self, numbers: list[int], times: list[int | None], done: int
     ) -> Iterator[tuple[int, int, Any]]:
-        """Read the data of one row after the other, from the row ``done`` of the same query."""
+        """Yield rows as `_rows` does, after the first ``done``; read the data of one at a time."""
         start, stop = times
         given = ",".join("?" * len(numbers))
         rows = (

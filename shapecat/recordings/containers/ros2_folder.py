@@ -109,7 +109,7 @@ class FolderRecording(Recording):
     def _listed_names(self) -> set[str]:
         """Return the file names under ``relative_file_paths`` of metadata.yaml.
 
-        It needs no YAML parser, since rosbag2 always writes the file in block style.
+        A regular expression is enough, since rosbag2 always writes the file in block style.
         """
         file = self.path / "metadata.yaml"
         try:
@@ -124,7 +124,7 @@ class FolderRecording(Recording):
         reasons = []
         for file in files:
             try:
-                if not file.stat().st_size:  # a recorder on a full disk leaves it
+                if not file.stat().st_size:  # a recorder leaves such a file on a full disk
                     msg = "is empty"
                     raise RecordingError(msg)  # noqa: TRY301  a reason like that of other parts
                 plain = self._decompressed(file) if file.suffix == ".zstd" else file

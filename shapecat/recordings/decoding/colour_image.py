@@ -1,4 +1,4 @@
-"""Decode colour images to RGB pixels: raw, JPEG, PNG, and the colours of point clouds."""
+"""Decode colour images (raw, JPEG or PNG) and the colours of point clouds to RGB pixels."""
 
 import io
 import struct
@@ -36,13 +36,13 @@ _CHANNELS = {
     "bgr16": (2, (2, 1, 0), 3),
     "mono8": (1, (0, 0, 0), 1),
 }
-"""Bytes per channel, the channel indices of red, green and blue, and channels per pixel."""
+"""Bytes per channel, indices of the red, green and blue channels, and channels per pixel."""
 
 _BAYER = {"bayer_rggb8": 0, "bayer_grbg8": 1, "bayer_gbrg8": 2, "bayer_bggr8": 3}
 """Index of the red pixel in a block of 2 x 2 pixels, row by row."""
 
 _LUMA = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
-"""Index of the first luma byte in the four bytes of two pixels."""
+"""Index of the first luma byte among the four bytes that encode two pixels."""
 
 _PIXEL_BYTES = {
     **{name: size * channels for name, (size, _, channels) in _CHANNELS.items()},
@@ -117,8 +117,8 @@ def pixels_of(image: ColourImage, *, shrink: int = 1) -> U1:
 
     Parameters
     ----------
-    shrink : a JPEG image may be decoded at 1/2, 1/4 or 1/8 of its size, which is several times as
-        fast, but at no less than 1 / ``shrink``. Other formats ignore this.
+    shrink : allow a JPEG image to be decoded at 1/2, 1/4 or 1/8 of its size, but not below
+        1 / ``shrink`` of it, which is several times as fast. Other formats ignore this.
 
     Returns
     -------
@@ -138,8 +138,7 @@ def encoded(image: ColourImage, pixels: U1) -> tuple[str, bytes]:
 
     Parameters
     ----------
-    pixels : (h, w, 3), from `pixels_of` at full size, which has checked that the image is
-        undamaged.
+    pixels : (h, w, 3) result of `pixels_of` at full size, which raises if the image is damaged.
     """
     from PIL import Image  # noqa: PLC0415  # loaded where there is colour
 
@@ -241,7 +240,7 @@ def cloud_colours(message: Any) -> U1:
 def colour_image(
     kind: str, topic: str, stamp_ns: int, log_time_ns: int, decoded: Any
 ) -> ColourImage:
-    """Return the colour image in a decoded message; only those of a cloud are decoded to pixels.
+    """Return the colour image in a decoded message; only colours of a cloud become pixels yet.
 
     Parameters
     ----------

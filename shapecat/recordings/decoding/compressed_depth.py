@@ -1,4 +1,4 @@
-"""Compressed depth images: 16-bit PNG, or the format of compressed_depth_image_transport."""
+"""Decode compressed depth images: 16-bit PNG, or compressed_depth_image_transport of ROS."""
 
 import io
 import struct
@@ -24,7 +24,7 @@ _GREY_16 = b"\x10\x00"
 
 
 def is_grey_png16(data: Any) -> bool:
-    """Return whether image data, of which 26 bytes are enough, is a PNG file of 16-bit grey."""
+    """Return whether image data is a 16-bit grey PNG file; its first 26 bytes are enough."""
     begin = bytes(data[:26])
     return compressed_kind(begin) == "png" and begin[24:] == _GREY_16
 
@@ -32,9 +32,9 @@ def is_grey_png16(data: Any) -> bool:
 def depth_of_compressed(message: Any) -> F4:
     """Read a decoded sensor_msgs/CompressedImage with a format such as ``16UC1; compressedDepth``.
 
-    The data is a PNG file, or begins with 12 bytes: the compression format and two parameters A and
-    B. For 32FC1 the stored value is A / depth + B, with depth in metres; otherwise it is in
-    millimetres.
+    The data is a bare PNG file, or a header of 12 bytes (compression format, parameters A and B)
+    followed by PNG or RVL data. With the format 32FC1, the stored values are A / depth + B, with
+    depth in metres; otherwise, they are millimetres.
 
     Returns
     -------

@@ -48,7 +48,7 @@ _SEPARATOR = "=" * 80 + "\n"
 
 
 def decode(message: Message, decoders: dict[tuple[str, str, bytes], Decoder]) -> Any:
-    """Decode a message; ``decoders`` caches one decoder per definition.
+    """Decode a message; store a decoder for its type in the cache ``decoders``.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def decode(message: Message, decoders: dict[tuple[str, str, bytes], Decoder]) ->
 def typestore_of(channel: Channel) -> Typestore:
     """Return a type store with the message types of a channel's definition.
 
-    Without a definition it holds the types of ROS 1 Noetic or ROS 2 Humble.
+    If the channel has no definition, the store holds the types of ROS 1 Noetic or ROS 2 Humble.
 
     Raises
     ------
@@ -114,7 +114,12 @@ def _idl_parts(text: str) -> Iterator[str]:
 
 
 def _refuse_unrolling(types: dict[str, Any]) -> None:
-    """Reject long fixed-size arrays of strings or messages: rosbags unrolls them into code."""
+    """Reject long fixed-size arrays of strings or messages, which rosbags would unroll into code.
+
+    Raises
+    ------
+    ValueError : an array has more than 4096 items.
+    """
     for name, (_, fields) in types.items():
         for field, description in fields:
             if description[0] != Nodetype.ARRAY:
@@ -158,8 +163,8 @@ _DECODERS: dict[str, Callable[[Channel], Decoder]] = {
 def schema_of(channel: Channel) -> tuple[str, str, bytes]:
     """Return name, encoding and text of a channel's schema.
 
-    A CDR channel without one gets the definition from ROS 2 Humble; encoding and text are empty
-    if its type is unknown there.
+    A CDR channel without a schema gets that of ROS 2 Humble; encoding and text are empty if its
+    type is unknown there.
     """
     if channel.schema or channel.encoding != "cdr":
         return channel.schema_name, channel.schema_encoding, channel.schema

@@ -18,7 +18,7 @@ def depth_of_image(message: Any, units: float | None = None) -> F4:
 
     Parameters
     ----------
-    units : units per metre of integer pixels; millimetres by default.
+    units : units per metre of integer pixels; by default 1000, since they are millimetres.
 
     Returns
     -------
@@ -26,7 +26,8 @@ def depth_of_image(message: Any, units: float | None = None) -> F4:
 
     Raises
     ------
-    MessageError : the encoding is not depth, the image is empty, or data is missing.
+    MessageError : the encoding is not depth, the image is empty, its rows are too short, or data is
+        missing.
     """
     height, width = int(message.height), int(message.width)
     if message.encoding not in DEPTH_ENCODINGS:
@@ -50,7 +51,7 @@ def depth_of_image(message: Any, units: float | None = None) -> F4:
 def clean_depth(values: F4 | U2, units: float = 1) -> F4:
     """Convert depth values (h, w) to metres; negative, infinite and NaN values become 0.
 
-    ``units`` is the number of units per metre; floating-point values are already metres.
+    ``units`` is the number of units per metre of integers; floating-point values are metres.
     """
     if values.dtype.kind == "u":
         # Dividing rounds to the nearest float; multiplying by 0.001 does not.

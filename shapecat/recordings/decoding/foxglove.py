@@ -17,7 +17,7 @@ _POINT_FIELDS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
 
 
 def as_ros(kind: str, message: Any) -> Any:
-    """Convert a decoded Foxglove message to the fields of its ROS counterpart.
+    """Convert a decoded Foxglove message to an object with the fields of its ROS counterpart.
 
     Messages of other types are returned unchanged. Byte fields may be base64 text, as in JSON.
     """
@@ -32,7 +32,7 @@ def ros_counterpart(kind: str) -> str:
 
 
 def _plain(kind: str) -> str:
-    """Return a Foxglove type's name in JSON and protobuf, given this name or its ROS name."""
+    """Return the JSON and protobuf name of a Foxglove type, given that or its ROS name."""
     return kind.replace("foxglove_msgs/msg/", "foxglove.")
 
 
@@ -50,7 +50,7 @@ def _stamp(time: Any) -> Any:
 
 
 def _vector(value: Any, names: str, default: Sequence[float]) -> Any:
-    """Read the coordinates `names` of a message; `default` if the message is absent."""
+    """Read the coordinates ``names`` of a message; return ``default`` if ``value`` is None."""
     values = default if value is None else [float(getattr(value, name)) for name in names]
     return SimpleNamespace(**dict(zip(names, values, strict=True)))
 
@@ -83,7 +83,7 @@ def _cloud(message: Any) -> Any:
 
 
 def _pose(pose: Any) -> Pose | None:
-    """Return a cloud's own pose; None if it has none, or the identity."""
+    """Return a cloud's own pose; None if it has none or it is the identity."""
     if pose is None:
         return None
     p = _vector(pose.position, "xyz", (0, 0, 0))

@@ -48,7 +48,7 @@ def cloud_points(message: Any) -> F4:
 
 
 def _axes(message: Any, step: int) -> list[tuple[int, str]]:
-    """Return byte offset and NumPy type of x, y and z."""
+    """Return the byte offset and the NumPy type of x, y and z in a point."""
     order = ">" if message.is_bigendian else "<"
     fields = {field.name: field for field in message.fields}
     missing = [n for n in "xyz" if n not in fields or int(fields[n].datatype) not in _FORMATS]

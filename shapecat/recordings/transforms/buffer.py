@@ -36,9 +36,9 @@ __all__ = [
 ]
 
 _TOLERANCE_NS = 100_000_000
-"""Time before its first and after its last sample in which a transform is taken as constant."""
+"""A transform is assumed constant for this long before its first sample and after its last one."""
 _FARTHEST_M = 1e9
-"""A larger translation is damage: nothing on Earth is so far from its centre."""
+"""Transforms with a larger translation are rejected as damaged."""
 _DEEPEST = 200
 _FIXED = ("map", "odom", "world")
 
@@ -48,7 +48,7 @@ class TransformError(ShapecatError):
 
 
 class ExtrapolationError(TransformError):
-    """A time is before the first or after the last transform of a frame."""
+    """The time of a look-up is before the first or after the last transform of a frame."""
 
 
 class TransformLoopError(TransformError):
@@ -56,7 +56,7 @@ class TransformLoopError(TransformError):
 
 
 class TransformBuffer:
-    """Transforms between frames; a static one is valid at all times at which there is no other."""
+    """Transforms between frames. A static transform is valid when there is no other one."""
 
     def __init__(self) -> None:
         """Make an empty buffer."""
@@ -64,7 +64,7 @@ class TransformBuffer:
         self._frames: set[str] = set()
 
     def forget(self, stamp_ns: int) -> None:
-        """Remove the transforms before a time, except the last one of each frame before it."""
+        """Remove the transforms before a stamp, except the last one of each frame."""
         for track in self._tracks.values():
             track.forget(stamp_ns)
 
@@ -94,7 +94,7 @@ class TransformBuffer:
         Returns
         -------
         Whether it was added; False if the transform is invalid: a frame has no name or is its own
-        parent, a number is not finite, the translation is larger than `_FARTHEST_M`, or the
+        parent, a number is not finite, the translation is longer than 1e9 m, or the
         quaternion is zero.
         """
         parent, child = parent.strip().lstrip("/"), child.strip().lstrip("/")
@@ -143,8 +143,10 @@ class TransformBuffer:
 
         Raises
         ------
-        TransformError : no transform names a frame, or no chain of them connects the two; it is an
-            ExtrapolationError or a TransformLoopError if this is the reason.
+        ExtrapolationError : a transform on the way is not known at that time.
+        TransformLoopError : the frames form a loop.
+        TransformError : no transform names one of the frames, or no chain of transforms connects
+            them.
         """
         target, source = self._require_frame(target), self._require_frame(source)
         up, down = self._ancestors(source, stamp_ns), self._ancestors(target, stamp_ns)
@@ -227,8 +229,8 @@ def fixed_frame(buffer: TransformBuffer, frame_id: str, at_ns: int | None = None
 
     Returns
     -------
-    The frame id; None if ``frame_id`` is in no transform, if it is the root itself, or if it is in
-    a loop of frames.
+    The name of the frame. None if ``frame_id`` is in no transform or in a loop, or if it is itself
+    the root and no frame of its tree has such a name.
     """
     sensor = frame_id.lstrip("/")
     try:
@@ -265,7 +267,8 @@ def read_transforms(
 
     Parameters
     ----------
-    sensor_topics : topics of the sensors, which decide between robots, see `transform_topics`.
+    sensor_topics : topics of the sensors; they select the robot if there are several, see
+        `transform_topics`.
     static_only : read only static transforms, which are few: their topics end in ``tf_static``.
     """
     reader = TransformReader(recording, TransformBuffer())

@@ -55,13 +55,13 @@ class Extrinsics:
         Parameters
         ----------
         depth_frame, colour_frame : frame ids of the messages.
-        log_time_ns, stamp_ns : of the depth image, nanoseconds. Images come in the order of the
-            recording.
+        log_time_ns, stamp_ns : of the depth image, nanoseconds. Call this with the images in the
+            order of the recording.
         """
         if is_of_realsense_recorder(self._depth.topic):
             return self._realsense
         if same_frame(depth_frame, colour_frame):
-            return IDENTITY if depth_frame else self._realsense  # two cameras may have no name
+            return IDENTITY if depth_frame else self._realsense  # both frame ids may be empty
         pose = self._lookup(self._still, depth_frame, colour_frame, stamp_ns)
         if pose is None:
             moving = self._moving.around(log_time_ns, stamp_ns)
@@ -96,9 +96,9 @@ class Extrinsics:
         return compose(colour, inverse(depth))
 
     def _driver_topics(self) -> list[str]:
-        """Return the driver's topics whose namespaces hold the depth topic, the longest first.
+        """Return the driver's extrinsics topics for the depth topic, the longest namespace first.
 
-        Without any, return the only such topic of the recording, if there is just one.
+        These have its namespace. If there are none, return the recording's only extrinsics topic.
         """
         names = {t.name for t in self._recording.topics if f"/{t.name}".endswith(_DRIVER)}
         around = [n for n in names if self._depth.topic.startswith(n.removesuffix(_DRIVER[1:]))]

@@ -29,7 +29,7 @@ class Misnaming(NamedTuple):
 
     Attributes
     ----------
-    text : the difference in words, for the user, after the topic.
+    text : the difference in words, to be shown to the user after the name of the topic.
     named_from_data : (3, 3) rotation from the frame of the data to the frame in ``frame_id``.
     """
 
@@ -57,11 +57,11 @@ MISNAMINGS = (
 
 
 class Orientation(NamedTuple):
-    """Up direction and pose of the sensor in a frame, from the recording.
+    """Up direction and sensor pose at one frame, as the recording gives them.
 
     Attributes
     ----------
-    source : source of ``up``; empty without one.
+    source : source of ``up``, such as ``transforms, z of map``; empty if ``up`` is None.
     up : (3,) the up direction in the sensor frame, a unit vector; None if unknown.
     fixed_from_sensor : the pose of the sensor in the fixed frame; None if unknown.
     """
@@ -73,20 +73,20 @@ class Orientation(NamedTuple):
 
 @dataclass
 class Upright:
-    """The up direction, and the pose of the sensor in the fixed frame, for each frame.
+    """Finds the up direction and the sensor pose of each frame.
 
-    Frames are looked up in the order of the recording, since only a little of the past is kept.
+    Frames must be looked up in the order of the recording, since only a little of the past is kept.
 
     Attributes
     ----------
-    fixed_frame : None until it is chosen at the first frame.
-    vector : (3,) the up direction in the sensor frame that the user gave, or None.
-    sources : ``tf`` and ``imu``, in the order in which they are tried; empty with a vector.
+    fixed_frame : name of the fixed frame; None until it is chosen at the first frame.
+    vector : (3,) the up direction in the sensor frame that the user gave; None if not given.
+    sources : ``tf`` and ``imu``, in the order in which they are tried; empty if there is a vector.
     warnings : for the user.
-    dropped : the source of the up direction that is ignored, by topic.
+    dropped : by topic, the source of an up direction that is ignored.
     failed, first_failure : the number of failed look-ups, and the error of the first.
     given : the number of frames by the source of their up direction.
-    misnamed : ``named_from_data`` of each topic whose data are not in the frame they name.
+    misnamed : by topic, the ``named_from_data`` of a `Misnaming` that was found.
     sensors : the frame ids of all sensors, as far as they are known.
     middle_ns : log time of the middle of the recording, nanoseconds.
     """
@@ -171,10 +171,10 @@ class Upright:
         return self._lookup(self.fixed_frame, frame)
 
     def _choose_fixed_frame(self, first: Frame) -> str | None:
-        """Choose the fixed frame of all sensors, one named after a map or odometry if there is.
+        """Choose one fixed frame for all sensors, preferably one named map, odom or world.
 
-        The pose of the sensors should be known in it halfway through the recording, since most
-        frames must have a pose for their objects to be tracked there.
+        It is best if the sensor poses are known halfway through the recording, since objects are
+        tracked in the fixed frame only if most frames have a pose. Returns None if there is none.
         """
         halfway_ns = first.stamp_ns + max(0, self.middle_ns - first.log_time_ns)
         candidates = [
@@ -185,7 +185,7 @@ class Upright:
         return min((name for name in candidates if name is not None), key=_rank, default=own_frame)
 
     def corrected(self, topic: str, orientation: Orientation) -> Orientation:
-        """Return the orientation of the data on a topic, given their named frame's orientation."""
+        """Convert an orientation from the frame that a topic's data name to their true frame."""
         source, up, pose = orientation
         turn = self.misnamed.get(topic)
         if turn is None:
@@ -200,7 +200,7 @@ class Upright:
         self.warnings.append(f"{topic}: {misnaming.text}; its transforms are corrected")
 
     def accept(self, topic: str, orientation: Orientation) -> F4 | None:
-        """Count an up direction by its source, and return it; None if it is unknown or dropped."""
+        """Return the up direction, or None if it is unknown or dropped; count it by its source."""
         up = None if topic in self.dropped else orientation.up
         source = "planes" if up is None else orientation.source
         self.given[source] = self.given.get(source, 0) + 1
@@ -260,7 +260,7 @@ class Upright:
         return "", None
 
     def _lookup(self, target: str, frame: Frame) -> Pose | None:
-        """Return the pose of the sensor in a frame; None if it is unknown."""
+        """Return the pose of the sensor in the frame ``target``; None if it is unknown."""
         transforms = self.transforms.around(frame.log_time_ns, frame.stamp_ns)
         offset = frame.frame_from_sensor
         if offset is not None and target == frame.frame_id.lstrip("/"):  # it may be in no transform
@@ -275,7 +275,7 @@ class Upright:
 
 
 def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:
-    """Return the level frames, best first: the sensor's own robot comes before others."""
+    """Return the frames with z up, best first; the sensor's own robot comes before others."""
 
     def order(name: str) -> tuple[int, bool, bool]:
         robot = name.rpartition("/")[0]
@@ -285,7 +285,7 @@ def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:
 
 
 def turned(up: F4, named_from_data: F8) -> F4:
-    """Convert a direction (3,) from the frame that data name to the frame of the data."""
+    """Convert a direction (3,) from the frame that data name to the true frame of the data."""
     return np.asarray(up @ named_from_data, np.float32)
 
 
@@ -295,7 +295,7 @@ def has_z_up(frame_id: str) -> bool:
 
 
 def _rank(name: str) -> int:
-    """Return the index in `_LEVEL_FRAMES` of a name without its robot; others come last."""
+    """Return the index of a frame, without its robot, in `_LEVEL_FRAMES`; others come last."""
     plain = name.rpartition("/")[2]
     return _LEVEL_FRAMES.index(plain) if plain in _LEVEL_FRAMES else len(_LEVEL_FRAMES)
 

@@ -1,4 +1,4 @@
-"""Accelerometers: at rest they measure the reaction to gravity, which points up."""
+"""Measure the up direction with accelerometers, which at rest sense the reaction to gravity."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,7 +17,7 @@ __all__ = ["Accelerometer", "Accelerometers"]
 IMU = "sensor_msgs/msg/Imu"
 _BIN_NS = 50_000_000
 _WINDOW = 10
-"""Bins averaged on each side: half a second, which smooths out motions."""
+"""Number of bins averaged before and after a time: half a second each, to smooth out motions."""
 
 
 @dataclass
@@ -38,9 +38,9 @@ class Accelerometer:
         self._sums = {at: total for at, total in self._sums.items() if at >= stamp // _BIN_NS}
 
     def up(self, stamp: int) -> F8 | None:
-        """Return the up direction in the IMU's frame around a time (ns), a unit vector (3,).
+        """Return the up direction in the IMU's frame at a time (ns), a unit vector (3,).
 
-        It averages half a second before and after; None if nothing was measured then.
+        It is an average over half a second before and after; None if there is no measurement.
         """
         at = stamp // _BIN_NS
         windows = [self._sums[k] for k in range(at - _WINDOW, at + _WINDOW + 1) if k in self._sums]
@@ -50,7 +50,7 @@ class Accelerometer:
 
 
 class Accelerometers:
-    """The accelerometers of a recording, with their measurements around its frames.
+    """The accelerometers of a recording, with their measurements around the current frame.
 
     Messages without an acceleration are left out: their first covariance is -1 (sensor_msgs/Imu),
     or all values are zero, as in messages of a gyroscope alone.
@@ -62,7 +62,7 @@ class Accelerometers:
         self._found: dict[str, Accelerometer] = {}
 
     def measure_anything(self) -> bool:
-        """Return whether the recording holds any acceleration."""
+        """Return whether the recording holds any acceleration; this may read all of it."""
         if not self._ahead.whole and not self._found:
             self._ahead.read_all()
         return bool(self._found)

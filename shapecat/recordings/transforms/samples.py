@@ -29,8 +29,9 @@ class TransformTrack:
 
     Attributes
     ----------
-    latched : whether the last one remains valid.
-    static : the static transform, which is valid where no other one is; None if there is none.
+    latched : whether the last transform remains valid for ever.
+    static : the static transform, valid when no other one is; None if there is none.
+    stamps : stamps of the samples, nanoseconds.
     """
 
     def __init__(self) -> None:
@@ -47,16 +48,19 @@ class TransformTrack:
         return TransformSample(self._parents[k], (x, y, z), tuple(quaternion))
 
     def gaps_ns(self, stamp: int) -> tuple[int, int]:
-        """Return the ns from the last sample to a time, and from the time to the first sample.
+        """Return the time (ns) from the last sample to a stamp, and from there to the first one.
 
-        A positive number means that the time is outside; latched samples never end.
+        A positive time means that the stamp is outside the samples; latched samples never end.
         """
         if not self.stamps:
             return _NEVER_NS, _NEVER_NS
         return 0 if self.latched else stamp - self.stamps[-1], self.stamps[0] - stamp
 
     def add(self, stamp: int, sample: TransformSample) -> None:
-        """Insert a sample by time; of three equal samples in a row, drop the middle one."""
+        """Insert a sample by time; it replaces one with the same stamp.
+
+        Of three equal samples in a row, the middle one is dropped.
+        """
         at, count = bisect_right(self.stamps, stamp), len(self.stamps)
         if at and self.stamps[at - 1] == stamp:
             self._set(slice(at - 1, at), stamp, sample)
@@ -66,7 +70,7 @@ class TransformTrack:
             self._set(slice(at, at), stamp, sample)
 
     def forget(self, stamp: int) -> None:
-        """Keep the last sample at or before a time (ns), and later ones; remove the others."""
+        """Remove the samples before a time (ns), except the last one at or before it."""
         first = bisect_right(self.stamps, stamp) - 1
         if first > 0:
             del self.stamps[:first], self._parents[:first], self._numbers[: 7 * first]
@@ -79,12 +83,15 @@ class TransformTrack:
 
 
 def pose_of(sample: TransformSample) -> Pose:
-    """Return ``parent_from_child``."""
+    """Return a sample as the pose ``parent_from_child``."""
     return Pose(rotation_from_quaternion(sample.quaternion), np.array(sample.translation))
 
 
 def interpolated(a: TransformSample, b: TransformSample, share: float) -> Pose:
-    """Interpolate between two samples: translations linearly, rotations by slerp."""
+    """Interpolate between two samples; ``share`` is 0 at ``a`` and 1 at ``b``.
+
+    Translations are interpolated linearly, rotations by slerp.
+    """
     translation = (1 - share) * np.array(a.translation) + share * np.array(b.translation)
     rotation = rotation_from_quaternion(
         _slerp(np.array(a.quaternion), np.array(b.quaternion), share)

@@ -15,7 +15,7 @@ TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
 class TransformTopics(NamedTuple):
-    """The topics with static transforms, and those with others."""
+    """The topics with static transforms, and those with transforms that may change."""
 
     static: set[str]
     moving: set[str]
@@ -44,7 +44,7 @@ def is_latched(kind: str) -> bool:
 def _of_other_robots(
     recording: Recording, spaces: Mapping[str, str], sensor_topics: Sequence[str]
 ) -> set[str]:
-    """Return the topics to leave out, given the namespace of each."""
+    """Return the topics of other robots, given the namespace of each topic."""
     around = {
         max(
             (s for s in spaces.values() if name.strip("/").startswith(f"{s}/")), key=len, default=""

@@ -15,9 +15,9 @@ from shapecat.recordings.transforms.topics import is_latched, transform_topics
 __all__ = ["TransformWindow"]
 
 _LAG_NS = AROUND_NS // 2
-"""If transforms are logged farther from their stamps, all are read at once."""
+"""If stamp and log time of a transform differ by more than this, all are read at once."""
 _NEAR_NS = 1_000_000_000
-"""Half the time around the middle of the recording of which transforms are read at first."""
+"""Before the first frame, transforms at most this far from the middle of the recording are read."""
 
 
 class TransformWindow:
@@ -25,8 +25,8 @@ class TransformWindow:
 
     Attributes
     ----------
-    tree : the static transforms, and the others from the first, the middle and the last seconds of
-        the recording. They give the names of all frames, and their parents.
+    tree : the static transforms, and the others from the start, the middle and the end of the
+        recording: enough to know the names and parents of all frames.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class TransformWindow:
         tree: TransformBuffer | None = None,
         ahead: LookAhead | None = None,
     ) -> None:
-        """Use ``buffer``: ``ahead`` keeps it filled; without that, it holds all transforms."""
+        """Use ``buffer``, which ``ahead`` fills as needed; None if it holds all transforms."""
         self.tree = buffer if tree is None else tree
         self._known, self._ahead = buffer, ahead
 
@@ -43,7 +43,7 @@ class TransformWindow:
     def of(cls, recording: Recording, sensor_topics: Sequence[str] = ()) -> "TransformWindow":
         """Read the static transforms of a recording, and the first, middle and last of the others.
 
-        The topics in ``sensor_topics`` decide between robots, see `transform_topics`.
+        ``sensor_topics`` selects the robot if there are several, see `transform_topics`.
         """
         topics = transform_topics(recording, sensor_topics).moving
         at_once = is_read_at_once(recording)
