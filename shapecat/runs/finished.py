@@ -23,8 +23,8 @@ __all__ = ["FinishedRun", "find_runs", "open_source", "read_finished", "require_
 class FinishedRun:
     """A run folder, with the content of run.json and the final label of each track.
 
-    ``common`` holds the categories of all runs that are exported together, in the same order in
-    each of them; empty if a run is on its own.
+    ``common`` holds the categories of all runs that are exported together, so that these have the
+    same order in each run; it is empty for a single run.
     """
 
     folder: Path
@@ -39,7 +39,7 @@ class FinishedRun:
 
     @property
     def categories(self) -> tuple[str, ...]:
-        """The common categories, then the model's, then the ones that a person added."""
+        """The categories in ``common``, then those of the model, then those that a person added."""
         of_model = dict.fromkeys((*self.common, *self.info["model"]["categories"]))
         added = {label.category for label in self.labels.values()} - {*of_model, "unknown"}
         return (*of_model, *sorted(added))
@@ -73,8 +73,8 @@ def read_finished(folder: Path) -> FinishedRun:
 def find_runs(folders: Sequence[Path]) -> list[Path]:
     """Return the run folders among ``folders`` and directly below them, each once.
 
-    The runs below a folder are sorted by name. Files beside folders are left out: the pattern
-    ``results/*`` also gives the manifest of a batch.
+    The runs below a folder are sorted by name. If there are folders, files are ignored, since the
+    pattern ``results/*`` matches the manifest of a batch, too.
 
     Raises
     ------
@@ -120,8 +120,8 @@ def open_source(
 
     Parameters
     ----------
-    moved_to : path of the recording; by default where it was processed.
-    advice : what to do if it was moved, for the error message.
+    moved_to : path of the recording; None for the path at which it was processed.
+    advice : advice in the error message if the recording was moved.
 
     Raises
     ------

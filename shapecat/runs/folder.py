@@ -1,4 +1,4 @@
-"""The folder of a run: built under a hidden name, renamed when complete.
+"""Build the folder of a run under a hidden name, and rename it when it is complete.
 
 A marker shows that shapecat made a folder: run.json with the run's id, or the record of an export.
 A folder without a marker is neither removed nor replaced. Other files in a run folder are kept.
@@ -39,7 +39,7 @@ OUTPUT_OPTIONS: Mapping[Literal["mcap", "rrd"], str] = {
     "mcap": "annotated.mcap",
     "rrd": "review.rrd",
 }
-"""The options that ask for an output, with its file; the tables do not depend on them."""
+"""The file of each option that asks for an output. The tables do not depend on these options."""
 OUTPUTS = tuple(OUTPUT_OPTIONS.values())
 RUN_FILES = (
     *(f"{name}.parquet" for name in ("frames", "detections", "planes", "tracks", "masks")),
@@ -55,15 +55,15 @@ _MADE = (
 )
 
 _OF_OUTPUTS = "tracks.parquet"
-"""The file whose lock is for the outputs, since nothing replaces it. The lock of the folder is for
-labels, which never wait long."""
+"""A file that a process locks while it writes outputs. No command replaces it in a finished run.
+The lock of the folder itself is for labels, which need not wait for outputs."""
 
 _BEGUN = (".run.json.partial", ".export.json.partial")
-"""Files that a kill may leave in a folder without a marker."""
+"""Files that a killed command may leave in a folder without a marker."""
 
 Marker = Callable[[Path], Collection[str] | None]
-"""A function of a folder: the names that shapecat makes in it, the marker last; None if there is no
-marker."""
+"""Returns the names of the files and folders that shapecat makes in a folder, the marker last; None
+if the folder has no marker."""
 
 
 def made_by_run(folder: Path) -> Collection[str] | None:
@@ -75,11 +75,11 @@ def made_by_run(folder: Path) -> Collection[str] | None:
 
 
 def require_work(folder: Path, work: str) -> None:
-    """Check that a run with other tracks has not replaced the one with the id ``work``.
+    """Check that the run in a folder still has the id ``work``, and so the same tracks.
 
     Raises
     ------
-    OutputError : ``work`` differs from that in run.json, or there is none.
+    OutputError : the run has another id, or there is none.
     """
     if read_run(folder)["work"] != work:
         msg = f"{folder}: was processed again since its report was made; make the report again"
@@ -96,7 +96,7 @@ def staged(
     """Provide a hidden folder; rename it to ``folder`` when the block succeeds.
 
     An earlier ``folder`` is moved away first and removed afterwards. After a signal or a kill, the
-    hidden folder is kept, so that the same command can resume; after an error, only if
+    hidden folder is kept, so that the same command can resume. After an error, it is kept if
     ``worth_keeping`` returns True for it. ``marker`` recognises folders that shapecat made.
 
     Raises
@@ -156,7 +156,7 @@ def _strangers(folder: Path, names: Collection[str]) -> Iterator[Path]:
 def _replace(folder: Path, hidden: Path, marker: Marker) -> None:
     """Rename the complete hidden folder; at any moment the old or the new folder is complete.
 
-    If a command writes the outputs of the old folder, wait for it: it would continue in the new.
+    If a command is writing outputs in the old folder, wait for it; it would go on in the new one.
     """
     flush(hidden)
     if folder.exists():
@@ -170,7 +170,7 @@ def _replace(folder: Path, hidden: Path, marker: Marker) -> None:
 
 
 def previous_path(folder: Path) -> Path:
-    """Return the hidden path that a folder has while a new one replaces it."""
+    """Return the hidden path to which a folder is moved while a new one replaces it."""
     return folder.with_name(f".{folder.name}.old")
 
 
@@ -189,10 +189,10 @@ def _retire(folder: Path, marker: Marker) -> None:
 
 
 def recover(folder: Path, marker: Marker = made_by_run) -> None:
-    """Complete the replacement of a folder that a killed run had begun, or undo it.
+    """Complete or undo the replacement of a folder that a killed run began.
 
-    The earlier folder is restored if there is no new one, else removed. ``marker`` recognises
-    folders that shapecat made; see `Marker`.
+    If there is no new folder, the earlier one is restored; else it is removed. ``marker``
+    recognises folders that shapecat made; see `Marker`.
 
     Raises
     ------
@@ -229,7 +229,7 @@ def sweep(folder: Path) -> None:
 
 @contextmanager
 def writing_outputs(folder: Path) -> Iterator[None]:
-    """Let only this process write the outputs of a finished run during the block.
+    """Lock the outputs of a finished run during the block, against other processes.
 
     Raises
     ------

@@ -21,7 +21,7 @@ __all__ = ["FullBoxes", "full_columns"]
 _BLOCK = 2**16
 _WIDTH = sum(FULL_WIDTHS.values())
 _MOST_VIEWS = 1000
-"""Largest number of views from which a track's box is fused, spread over its time span."""
+"""Maximum number of views from which the box of a track is fused, spread over its time span."""
 _AT_ONCE = 8  # row groups
 _NO_ROWS = np.zeros(0, np.int64)
 
@@ -35,29 +35,30 @@ class _Selection(NamedTuple):
 
 
 def _boxes_of(table: pa.Table) -> F4:
-    """Return `_BOXES` (n, 11): metres, x y z w, and 1 if occluded or cut off."""
+    """Return the values of `_BOXES` (n, 11): full boxes, and 1 if the object is partly hidden."""
     cut = np.logical_or(*(table[name].to_numpy() for name in _CUT))
     return np.column_stack([full_boxes_of(table), cut])
 
 
 def _details_of(table: pa.Table) -> F4:
-    """Return `_DETAILS` (n, 3 + `DIRECTIONS`), metres."""
+    """Return the values of `_DETAILS` (n, 3 + `DIRECTIONS`), metres."""
     columns = [numbers(table[name]).reshape(len(table), -1) for name in _DETAILS.columns]
     return np.hstack(columns)
 
 
 _CUT = ("touches_border", "occluded")
 _BOXES = _Selection([*FULL_BOX, *_CUT], BOX_WIDTH + 1, _boxes_of)
-"""The full box of a detection, NaN if unknown, and whether it is occluded or cut off."""
+"""Centre, size (metres) and orientation (x y z w) of a detection's full box, NaN if unknown; and
+whether the object is occluded or cut off by the image border."""
 _DETAILS = _Selection(["size_full_std", "outline_full"], 3 + DIRECTIONS, _details_of)
 """The standard deviations and the outline of the full box of a detection."""
 
 
 @dataclass(frozen=True)
 class FullBoxes:
-    """The full boxes of all detections of a run, estimated from single views.
+    """The full boxes of all detections of a run, each estimated from a single view.
 
-    Boxes are read when they are needed.
+    They are read from the table when they are needed.
 
     Attributes
     ----------
@@ -69,15 +70,17 @@ class FullBoxes:
     frames: DetectedFrames
 
     def of_tracks(self, tracks: Sequence[Track], categories: Sequence[str]) -> F4:
-        """Return the fused boxes of some tracks in each of their frames, track after track.
+        """Fuse the full boxes of each track; return the result in each of its frames.
 
         Parameters
         ----------
-        tracks : their ``detections`` are rows of the table.
+        tracks : their ``detections`` are row numbers of the table.
+        categories : names of the categories in the posteriors.
 
         Returns
         -------
-        (k, 13) float32 with the columns of `FULL_WIDTHS`, in the sensor frame; NaN if unknown.
+        (k, 13) float32, a row for each frame of each track in turn: the columns of `FULL_WIDTHS`,
+        in the sensor frame; NaN if unknown.
 
         Raises
         ------
@@ -105,7 +108,7 @@ class FullBoxes:
         return result
 
     def _sightings(self, tracks: Sequence[Track]) -> "list[_Sighting]":
-        """Return the detections of each track that have a full box."""
+        """Return, for each track, its detections that have a full box."""
         detected = [np.flatnonzero(track.detections >= 0) for track in tracks]
         rows = [track.detections[at] for track, at in zip(tracks, detected, strict=True)]
         result = []
@@ -116,14 +119,14 @@ class FullBoxes:
         return result
 
     def _views(self, sighting: "_Sighting", picked: I4, details: F4) -> BoxViews:
-        """Return the boxes of some views of a track in the fixed frame; see `_DETAILS`."""
+        """Return the views ``picked`` of a track in the fixed frame; ``details`` are `_DETAILS`."""
         boxes, poses = sighting.boxes[picked], self.frames.poses_of(sighting.rows[picked])
         centers, axes = _placed(boxes, poses)
         sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)
         return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
 
     def _show(self, fused: FusedBox, sighting: "_Sighting", result: F4) -> None:
-        """Write the fused box to ``result``, in the sensor frame of each view."""
+        """Write the fused box of a track to ``result`` (frames, 13), in each sensor frame."""
         for first in range(0, len(sighting.rows), _BLOCK):
             block = slice(first, first + _BLOCK)
             boxes, poses = sighting.boxes[block], self.frames.poses_of(sighting.rows[block])
@@ -161,7 +164,7 @@ class _Sighting(NamedTuple):
 
 
 def _split(values: F4, lengths: Sequence[int]) -> list[F4]:
-    """Return consecutive parts of an array, which have these lengths."""
+    """Split an array into consecutive parts of the given lengths."""
     return np.split(values, np.cumsum(lengths, dtype=np.int64))[:-1]
 
 

@@ -2,8 +2,8 @@
 
 A run has two ids. ``id`` is random and marks one folder as made by shapecat. ``work`` identifies
 the recording and how it was processed: runs with the same ``work`` have the same frames,
-detections, planes and tracks, and tracks.csv has it in each line. Their masks differ if their
-colour topics do.
+detections, planes and tracks, but other masks if their colour topics differ. Each line of
+tracks.csv holds ``work``.
 """
 
 import json
@@ -36,7 +36,7 @@ _BLOCK = 1 << 20
 _OUTPUTS = ("color", "mcap", "rrd")
 
 Stats = list[list[Any]]
-"""Per file: name, size in bytes, and the times when content and inode changed, nanoseconds."""
+"""For each file: name, size in bytes, and the times (ns) when content and inode changed last."""
 
 
 def new_id() -> str:
@@ -45,10 +45,11 @@ def new_id() -> str:
 
 
 def work_id(run: RunInfo) -> str:
-    """Return the id of the work that run.json describes, once the digest of the input is known.
+    """Return the ``work`` id of a run; ``run`` must have the digest of the input.
 
-    It is a hash of content, settings, options, model and version, without those that affect only
-    masks and outputs. The first letter keeps spreadsheets from reading a number.
+    The id is a hash of the recording's content, settings, options, model and version, without the
+    settings and options that affect only masks and outputs. It begins with a letter, so that no
+    spreadsheet reads it as a number.
     """
     settings = {name: value for name, value in run["settings"].items() if name != "outputs"}
     options = {name: value for name, value in run["options"].items() if name not in _OUTPUTS}
@@ -75,7 +76,7 @@ def unchanged(before: Sequence[Sequence[Any]], path: Path) -> bool:
 
 
 def content_digest(path: Path, *, cancelled: Event | None = None) -> str:
-    """Return a digest of the whole content of a recording: of a file, or of a bag's files.
+    """Return a digest of the whole content of a recording: a file, or the files of a bag.
 
     XXH3 with 128 bits (Collet 2019) is as fast as memory and detects damage, but not forgery.
 

@@ -1,4 +1,4 @@
-"""Jobs: recordings with their options. Runs: descriptions of results in run.json."""
+"""Describe jobs (a recording and how to process it) and runs (their results, in run.json)."""
 
 import platform
 from collections.abc import Iterable, Mapping
@@ -51,7 +51,7 @@ class Job:
     folder : where the results are written, ``DIR/NAME``.
     topics : depth topics; empty to choose one.
     up : ``auto``, ``tf``, ``imu``, or a vector ``X,Y,Z`` in the sensor frame.
-    fixed_frame : None to choose one.
+    fixed_frame : name of the fixed frame; None to choose one.
     frame_range : the frames to process.
     model : path of the model file; None for the default model.
     model_id : id that the model must have; empty for any.
@@ -61,8 +61,8 @@ class Job:
     discard_labels : whether to discard the labels of the replaced results.
     origin : URL from which ``source`` was downloaded; empty if none.
     target : URL to which the results are uploaded; empty if none.
-    input_key, work_key : empty if unknown; the first changes with the content of the recording, the
-        second with the options, settings and model.
+    input_key : changes with the content of the recording; empty if unknown.
+    work_key : changes with the options, settings and model; empty if unknown.
     """
 
     source: Path
@@ -96,11 +96,11 @@ class Job:
 
     @property
     def keys(self) -> OriginInfo:
-        """The keys of input and work, as stored in run.json at a URL."""
+        """``input_key`` and ``work_key``, as stored in a run.json at a URL."""
         return {"input": self.input_key, "work": self.work_key}
 
     def made(self, run: RunInfo) -> bool:
-        """Return whether a run at a URL has the keys of this job; False if these are unknown."""
+        """Return whether a run at a URL has the keys of this job; False if the job has none."""
         return bool(self.input_key and self.work_key) and run.get("origin") == self.keys
 
     def selection(self) -> Options:
@@ -120,10 +120,14 @@ class Job:
 
 @dataclass(frozen=True)
 class Summary:
-    """A summary of a run; ``processed`` is False if it was already complete.
+    """A summary of a run.
 
-    ``corrections`` is the outcome of transferring labels from the replaced run; None if there were
-    no labels.
+    Attributes
+    ----------
+    counts : entry of run.json.
+    seconds : total duration of the run.
+    processed : False if the run was complete before.
+    corrections : outcome of transferring labels from the replaced run; None if there were none.
     """
 
     counts: Mapping[str, Any]
@@ -134,7 +138,7 @@ class Summary:
 
 
 def describe_run(job: Job, categorizer: Categorizer) -> RunInfo:
-    """Return the content of run.json for new work; the digest of the input follows later."""
+    """Return the run.json of a new run; `identify` sets its digest and ``work`` id later."""
     return {
         "id": new_id(),
         "work": "",
@@ -166,11 +170,11 @@ def differences(run: RunInfo, planned: Mapping[str, Any]) -> dict[str, str]:
 
     Parameters
     ----------
-    planned : run.json of the planned run, of which only these entries are needed.
+    planned : the run.json of the planned run, or just its settings, options and model.
 
     Returns
     -------
-    The text of the values by name; the names of settings are as in ``detection.max_range_m``.
+    Both values as text, by name; settings have names such as ``detection.max_range_m``.
     """
     entries, planned_entries = (_entries(each) for each in (run, planned))
     return {
@@ -182,13 +186,13 @@ def differences(run: RunInfo, planned: Mapping[str, Any]) -> dict[str, str]:
 
 
 def describe_differences(differing: Mapping[str, str]) -> str:
-    """Return, for a message, how a run differs: its `differences`, and any in the input."""
+    """Return the `differences` of a run, and any in the input, as words for an error message."""
     listed = "; ".join(f"{name}: {text}" for name, text in differing.items())
     return f"another input, model or settings ({listed})"
 
 
 def _entries(run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings, options and model of a run, each by its name."""
+    """Return the settings, options and model of a run, by name."""
     tree: dict[str, Any] = {**run["settings"], **run["options"], "model": run["model"]["id"]}
     entries: dict[str, Any] = {}
     for name, value in tree.items():
@@ -220,7 +224,7 @@ def identify(run: RunInfo, content: ContentDigest) -> None:
 
 
 def update_place(run: RunInfo, found: InputInfo) -> bool:
-    """If a run's recording is gone from its path, store where it was ``found``, return True."""
+    """Store in a run where its recording was ``found``, if it was moved; return whether it was."""
     moved = not Path(run["input"]["path"]).exists() and run["input"]["path"] != found["path"]
     if moved:
         run["input"] |= {"path": found["path"], "files": found["files"]}

@@ -76,7 +76,7 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
 
 
 class _MasksByFrame:
-    """The masks of frames, requested in the order of the table; some frames have none."""
+    """The masks of the frames, which must be requested in the order of the table."""
 
     def __init__(self, rows: Iterator[tuple[Key, ImageMasks]]) -> None:
         self._rows = rows
@@ -91,7 +91,7 @@ class _MasksByFrame:
 
     @property
     def has_more(self) -> bool:
-        """Whether there are masks of frames that were not requested in the order of the table."""
+        """Whether masks are left: their frames were not requested, or in another order."""
         return self._next is not None
 
 
@@ -106,7 +106,7 @@ def rows_by_frame(table: pa.Table) -> dict[tuple[str, int], list[dict[str, Any]]
 
 
 def _values(column: pa.ChunkedArray) -> Sequence[Any]:
-    """Return the values of a column: arrays for a list column without nulls, else Python values."""
+    """Return the value of each row: an array in list columns without nulls, else a Python value."""
     fixed = pa.types.is_fixed_size_list(column.type)
     if column.null_count or not (fixed or pa.types.is_list(column.type)):
         return list(column.to_pylist())
@@ -124,6 +124,7 @@ def _labelled_frame(
     tracks: LabelledTracks,
     ended: tuple[int, ...],
 ) -> LabelledFrame:
+    """Join the table rows of a frame, its detections (by number) and its planes."""
     key = (row["topic"], row["frame"])
     pose = None
     if row["fixed_translation"] is not None:

@@ -46,11 +46,11 @@ class LabelledTracks:
 
     Attributes
     ----------
-    frames : for each frame, its rows of the arrays below.
+    frames : the rows of each frame in the arrays below.
     detections : (rows,) number of each detection in its frame.
     tracks : (rows,) number of its track.
     labels : the final label of each track.
-    last_in : the tracks that end in each frame; frames in which none ends are missing.
+    last_in : by frame, the tracks that end in it; frames in which none ends are missing.
     causal : (rows, categories) posterior of each track up to the frame; empty unless requested.
     full : (rows, 10) centre, size (metres) and orientation of the full boxes in the sensor frame;
         NaN if unknown.
@@ -92,10 +92,10 @@ class LabelledTracks:
             )
 
     def objects(self, key: Key) -> dict[TrackLabel, dict[int, int]]:
-        """Return, for each label in a frame, the rows of its detections by their numbers.
+        """Return the objects of a frame by label: array rows of their detections, by number.
 
-        An object has several detections where a person merged their tracks. Objects are in the
-        order of their first detections.
+        An object has several detections if a person merged tracks that are both in the frame.
+        Objects are in the order of their first detections.
         """
         rows = self.frames.get(key, _NO_ROWS)
         rows_by_label: dict[TrackLabel, dict[int, int]] = {}
@@ -105,9 +105,9 @@ class LabelledTracks:
         return rows_by_label
 
     def endings(self) -> Callable[[Key], tuple[int, ...]]:
-        """Return a function to call with each frame in turn.
+        """Return a function that must be called with each frame in turn.
 
-        It returns the tracks that ended in the previous frame of the same topic.
+        For each, it returns the tracks that ended in the previous frame of the same topic.
         """
         latest: dict[str, Key] = {}
 
@@ -128,9 +128,9 @@ def read_annotation_frames(
 ) -> Iterator[AnnotationFrame]:
     """Yield the annotations of a run, frame by frame in reading order.
 
-    This omits points, surfaces and posteriors, and is several times as fast as
-    `shapecat.runs.labelled_frames.read_labelled_frames`. Boxes enclose whole objects where their
-    size is known; with ``visible``, only their visible parts. They are in the frame ``frame_id``.
+    Annotations lack points, surfaces and posteriors, and are read several times as fast as with
+    `shapecat.runs.labelled_frames.read_labelled_frames`. Their boxes are full boxes if these are
+    known and ``visible`` is False, else visible boxes. They are in the frame ``frame_id``.
 
     Raises
     ------
@@ -162,7 +162,7 @@ def _boxes(
     *,
     visible: bool,
 ) -> Iterator[tuple[AnnotationBox, ...]]:
-    """Yield the boxes to annotate in each of some frames, given the up direction in each."""
+    """Yield the boxes of each frame in ``keys``; ``ups`` (n, 3) are the up directions in these."""
     all_rows, places = frame_rows(detections), _places(detections)
     spans = [tracks.frames.get(key, _NO_ROWS) for key in keys]
     of_frames = [all_rows.get(key, _NO_ROWS) for key in keys]
@@ -186,7 +186,7 @@ def _boxes(
 
 
 def _join(places: F8, up: F4) -> F8:
-    """Return the box (10,) around the boxes (n, 10) of an object."""
+    """Return the upright box (10,) around the boxes (n, 10) of an object; a single box as it is."""
     place: F8 = places[0]
     if len(places) > 1:
         box = box_around((Box(row[:3], row[3:6], row[6:]) for row in places), up)
@@ -228,7 +228,10 @@ def _places(table: pa.Table) -> F8:
 def _in_named_frame(
     boxes: Sequence[AnnotationBox], translation: Sequence[float] | None, rotation: Any
 ) -> tuple[AnnotationBox, ...]:
-    """Transform boxes by ``frame_from_sensor``, whose parts are None if it is not needed."""
+    """Transform boxes from the sensor frame to the frame named in ``frame_id``.
+
+    ``translation`` and ``rotation`` (row by row) are None if the two frames are the same.
+    """
     if translation is None:
         return tuple(boxes)
     pose = Pose(np.reshape(rotation, (3, 3)), np.array(translation))
@@ -245,8 +248,8 @@ def _in_named_frame(
 def _last_in(frames: Mapping[Key, slice], tracks: I4, stamps_ns: I4) -> dict[Key, tuple[int, ...]]:
     """Return the tracks that end in each frame.
 
-    Of the last frames of a track in several topics, the latest counts. Within a topic, numbers of
-    frames decide, as a clock may be set back.
+    Within a topic, the last frame of a track is the one with the highest number, since a clock may
+    be set back. If a track is in several topics, it ends in the latest of these frames by stamp.
     """
     keys = np.repeat(np.arange(len(frames)), [rows.stop - rows.start for rows in frames.values()])
     names = list(frames)

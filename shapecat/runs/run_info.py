@@ -79,7 +79,7 @@ class Counts(TypedDict):
 
 
 class OriginInfo(TypedDict):
-    """Keys of the recording and of the work in a run folder at a URL; see `Job`."""
+    """`Job.input_key` and `Job.work_key` of a run whose results are at a URL."""
 
     input: str
     work: str
@@ -124,9 +124,13 @@ _hints_of = cache(get_type_hints)
 
 
 def wrong_entry(content: Any, kind: Any = RunInfo, name: str = "") -> str | None:
-    """Return the first entry of a run.json that is missing or of a wrong type, None if all fit.
+    """Return the name of the first missing or mistyped entry of a run.json; None if all are fine.
 
-    ``kind`` is the type that ``content``, at ``name``, must have.
+    Parameters
+    ----------
+    content : the decoded JSON, or a part of it.
+    kind : the type that ``content`` must have.
+    name : the name of ``content``, such as ``options.up``; empty for the whole run.json.
     """
     origin, parts = get_origin(kind), get_args(kind)
     if origin is UnionType:
@@ -153,7 +157,7 @@ def wrong_entry(content: Any, kind: Any = RunInfo, name: str = "") -> str | None
 
 
 def parse_run(content: bytes, folder: str) -> RunInfo:
-    """Return the content of the run.json of a folder or URL.
+    """Return the content of a run.json; ``folder`` is its folder or URL, for error messages.
 
     Raises
     ------
@@ -171,7 +175,7 @@ def parse_run(content: bytes, folder: str) -> RunInfo:
 
 
 def parse_identity(content: bytes, folder: str) -> RunIdentity:
-    """Return the content of the run.json of a folder or URL; only some entries are checked.
+    """Return the content of a run.json; check only the entries that every version writes.
 
     Raises
     ------

@@ -70,7 +70,7 @@ _UNMOVED = ("numbers", "sizes", "posteriors", "novelties", "partial", "described
 def track_run(
     folder: Path, settings: TrackingSettings, categories: Sequence[str], *, work: str = ""
 ) -> dict[str, int]:
-    """Track the detections of a run; write tracks.parquet, tracks.csv and its original.
+    """Track the detections of a run; write tracks.parquet, tracks.csv and tracks.original.csv.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def _batches(tracks: Iterable[Track]) -> Iterator[list[Track]]:
 
 
 def _parts(tracks: list[Track]) -> Iterator[tuple[list[Track], slice]]:
-    """Yield the tracks to write at once, and their rows: a long track is written in parts."""
+    """Yield the tracks to write at once, and their rows. A long track is written in parts."""
     if len(tracks) != 1:
         yield tracks, slice(None)
         return
@@ -138,10 +138,10 @@ def _parts(tracks: list[Track]) -> Iterator[tuple[list[Track], slice]]:
 
 
 def _read_streams(folder: Path, categories: int, placed: set[str]) -> Iterator[DetectionTable]:
-    """Yield the detections of each stream, numbered by their rows in the table.
+    """Yield the detections that are tracked together, numbered by their rows in the table.
 
-    The topics ``placed`` form one stream, in the fixed frame; every other topic is a stream of its
-    own, in the sensor frame.
+    Those of all topics in ``placed`` are tracked together, in the fixed frame; those of any other
+    topic on their own, in its sensor frame.
     """
     streams: dict[str, TableBuilder] = {}
     count = 0
@@ -191,7 +191,7 @@ def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
 
 
 def _turns_of(frames: pa.Table, placed: Collection[str]) -> F8:
-    """Return the rotations (f, 3, 3) to the fixed frame; the identity for topics not ``placed``."""
+    """Return the rotations (f, 3, 3) to the fixed frame; identity if unknown or not ``placed``."""
     turns = numbers_or_nan(frames["fixed_rotation"]).reshape(-1, 3, 3)
     moved = np.array([topic in placed for topic in frames["topic"].to_pylist()])
     moved = moved[:, None, None] & ~np.isnan(turns)

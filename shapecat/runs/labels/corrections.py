@@ -1,4 +1,4 @@
-"""Corrections of a run: the column ``label`` of tracks.csv, checked and applied."""
+"""Check and apply the corrections of a run: the column ``label`` of tracks.csv."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -39,9 +39,9 @@ __all__ = [
 
 PREVIOUS = "tracks.previous.csv"
 LOST = "tracks.previous-*.csv"
-"""Names of replaced tables of which labels could not be transferred; nothing replaces these."""
+"""Names of replaced tables with labels that could not be transferred. Later runs keep them."""
 _MOST_PROBLEMS = 20
-"""At most this many problems of a table are named."""
+"""Maximum number of problems of a table in an error message."""
 
 
 def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLabel]:
@@ -66,9 +66,14 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
 
 
 def read_original_table(path: Path) -> tuple[TrackTable, list[str]]:
-    """Read the labels and added columns in the tracks.csv of a run, and the problems of its lines.
+    """Read the tracks.csv of a run, and restore what a person must not change.
 
-    Other cells and the order come from tracks.original.csv; missing tracks are a problem.
+    Labels and added columns are from tracks.csv, other cells and the order from
+    tracks.original.csv.
+
+    Returns
+    -------
+    The table, and the problems of lines, including missing tracks.
 
     Raises
     ------
@@ -101,7 +106,7 @@ def read_original_table(path: Path) -> tuple[TrackTable, list[str]]:
 
 
 def _require_content(path: Path) -> None:
-    """Check that the table of a run is there, if the run's own table is.
+    """Check that a tracks.csv has not been lost: it must exist if its tracks.original.csv does.
 
     Raises
     ------
@@ -115,7 +120,7 @@ def _require_content(path: Path) -> None:
 
 
 def _contradictions(table: TrackTable, original: TrackTable) -> list[str]:
-    """Return the problems of lines that contradict a run's own table."""
+    """Return the problems of lines whose track or category contradicts the original table."""
     stored = {row.track: row.category for row in original.rows}
     problems = []
     for row in table.rows:
@@ -132,10 +137,11 @@ def _contradictions(table: TrackTable, original: TrackTable) -> list[str]:
 def adopt_labels(corrected: Path, folder: Path) -> None:
     """Apply the labels of a corrected table to a run.
 
-    Only the column ``label`` is read. Tracks that a table elsewhere does not list keep their label,
-    and so do those whose label equals that in a column ``label_seen``, which a report page writes:
-    it may be older than other corrections. If labels are replaced, the table before is kept as
-    tracks.previous.csv. ``corrected`` may be the run's own tracks.csv, which must list all tracks.
+    Only the column ``label`` is applied. ``corrected`` may be the run's own tracks.csv, which must
+    list all tracks. Tracks that another table does not list keep their labels. A report page adds a
+    column ``label_seen`` with the labels that it read: tracks for which the two columns are equal
+    keep their labels, too, since other corrections may be newer. If labels are replaced, the
+    previous table is kept as tracks.previous.csv.
 
     Raises
     ------
@@ -175,7 +181,7 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
 
     Returns
     -------
-    For each track whose label was rejected, why: it is invalid, or contradicts other labels.
+    The reason for each rejected label, by track: it is invalid, or contradicts other labels.
 
     Raises
     ------
@@ -199,7 +205,7 @@ def correct_label(folder: Path, track: int, label: str, *, previous: str, work: 
     Parameters
     ----------
     previous : the label that the caller read.
-    work : the value in the run.json that the caller read.
+    work : the ``work`` id in the run.json that the caller read.
 
     Returns
     -------
@@ -261,7 +267,7 @@ def has_labels(path: Path) -> bool:
 
 
 def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:
-    """Return a table with the labels and line numbers of other rows."""
+    """Return a table with the labels and line numbers in ``rows``, for the tracks listed there."""
     edited = {row.track: row for row in rows}
     changed = [
         replace(with_label(row, edited[row.track].label), line=edited[row.track].line)

@@ -1,4 +1,4 @@
-"""The meaning of the label that a person gives a track.
+"""Interpret the label that a person gives a track.
 
 A label is a category, a new category, ``delete``, or ``merge with N``.
 """
@@ -36,15 +36,15 @@ _NAME = re.compile(r"[^\W\d_][\w .+&'()-]{0,58}[\w)]|[^\W\d_]")
 NAME_RULE = (
     "a letter followed by letters, digits, spaces and - _ . + & ' ( ), at most 60 characters"
 )
-"""The form of a category's name, in words."""
+"""The rule for the name of a category, in words."""
 _SHOWN = 80
-"""Letters of an invalid label that a message shows."""
+"""Maximum number of characters of an invalid label in a message."""
 
 
 class TrackLabel(NamedTuple):
     """The number, category and confidence with which a track is shown.
 
-    A track that was merged with another one takes all three from the other.
+    A track that is merged with another one has all three from the other.
     """
 
     track: int
@@ -76,7 +76,7 @@ def merging_with(track: int) -> str:
 
 
 def marked_as_new(label: str) -> str:
-    """Return a label whose category is marked as new, unless it is marked or has none.
+    """Mark the category in a label as new; return other labels, and marked ones, unchanged.
 
     Examples
     --------
@@ -94,7 +94,7 @@ _Verdict = str | int | None
 def find_misread(
     rows: Sequence[TrackRow], categories: Iterable[str] = (), *, one_frame: bool = True
 ) -> dict[int, str]:
-    """Return the problem of each invalid or contradictory label, by track number."""
+    """Return the problem of each invalid or contradictory label, as `resolve_labels` does."""
     return resolve_labels(rows, categories, one_frame=one_frame)[1]
 
 
@@ -106,12 +106,12 @@ def resolve_labels(
     Parameters
     ----------
     categories : known categories, besides those in the rows.
-    one_frame : whether tracks of different topics may be merged.
+    one_frame : whether tracks of different topics may be merged, since they share a fixed frame.
 
     Returns
     -------
-    The final labels, and the problems of invalid labels, both by track number. Deleted tracks have
-    neither.
+    The final labels, and the problems of invalid labels, both by track number. A deleted track is
+    in neither.
     """
     names = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
     verdicts: dict[int, _Verdict] = {}
@@ -220,12 +220,12 @@ def order_categories(labels: Iterable[str]) -> tuple[str, ...]:
 
 
 def _without_marks(text: str) -> str:
-    """Return a text without accents and vowel signs that are characters of their own."""
+    """Return a text without the accents and vowel signs that are separate characters."""
     return "".join(c for c in text if not unicodedata.category(c).startswith("M"))
 
 
 def _nearest(name: str, names: Sequence[str]) -> str | None:
-    """Return the nearest known name within one edit (short names) or two; None if there is none."""
+    """Return the most similar name, at most one edit (short names) or two edits away, or None."""
     distances = [(_slips(name, candidate), candidate) for candidate in names]
     slips, candidate = min(distances)
     return candidate if slips <= (1 if min(len(name), len(candidate)) < 5 else 2) else None

@@ -19,7 +19,7 @@ _OTHER = f"the recording is another one; `annotate --by-place --labels {PREVIOUS
 
 
 def require_labels(job: Job) -> None:
-    """Check that the labels of the results to be replaced are readable, before hours of work.
+    """Check, before hours of work, that the labels of the results to be replaced are readable.
 
     Raises
     ------
@@ -31,11 +31,15 @@ def require_labels(job: Job) -> None:
 def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
     """Transfer the corrected labels of the replaced results to the new ones.
 
-    Only labels of the same recording are transferred: in another one, other objects may be at the
-    same places.
+    Labels of another recording are not transferred, since other objects may be at the same places.
 
-    The replaced table is kept as tracks.previous.csv. If some labels could not be transferred, a
-    copy is also put among the replaced results, from where it passes to all later ones.
+    The replaced table is kept as tracks.previous.csv. If some labels cannot be transferred, a copy
+    is also put in the replaced folder under a name of its own, and so kept in all later results.
+
+    Parameters
+    ----------
+    folder : hidden folder of the new run.
+    run : run.json of the new run; its entry ``corrections`` is set.
 
     Raises
     ------
@@ -61,7 +65,7 @@ def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
 def forget_old_labels(folder: Path, run: RunInfo, job: Job) -> None:
     """Undo `keep_labels` if the replaced results have been given other labels since.
 
-    Labels and outputs then count as missing in ``run``.
+    ``run`` then lists the phases of labels and outputs as not done, so that they are repeated.
 
     Raises
     ------
@@ -81,6 +85,6 @@ def forget_old_labels(folder: Path, run: RunInfo, job: Job) -> None:
 
 
 def _labelled_table(job: Job) -> bytes:
-    """Return the table of the replaced results if it has labels to keep, else nothing."""
+    """Return the tracks.csv of the results to be replaced; empty if it has no labels to keep."""
     table = job.folder / "tracks.csv"
     return b"" if job.discard_labels or not has_labels(table) else table.read_bytes()

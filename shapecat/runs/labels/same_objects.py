@@ -22,18 +22,19 @@ from shapecat.runs.labels.track_table import TrackRow, parse_number
 __all__ = ["Group", "Match", "Matches", "match_in_place", "match_in_time"]
 
 _MOST_REACH_M = 0.10
-"""Largest distance between two detections of one object in one frame, however segmented."""
+"""Largest distance between the detections of one object in two runs, in the same frame."""
 _MAJORITY = 0.6
 """Smallest fraction of common frames in which matching tracks are mutual nearest neighbours."""
 _RIVAL = 0.25
-"""Another track with at least this fraction makes a match ambiguous."""
+"""A match is ambiguous if another track has at least this fraction."""
 _STILL_M = 0.04
-"""Largest scatter of the centres of an object at rest, seen from several places."""
+"""Largest scatter of the centres of a small object at rest, seen from several places."""
 _REACH = 0.5
 """Largest distance between the centres of one object in two views, relative to its width."""
 _LEAST_REACH_M = 0.04
+"""Lower limit of that distance, for small objects."""
 _CLEAR_M = 0.03
-"""A match is ambiguous unless the second nearest object is farther by at least this."""
+"""A match is ambiguous unless the next object is farther away by at least this."""
 _SIZE_RATIO = 1.8
 """Largest ratio between the largest extents of an object in two recordings."""
 
@@ -59,12 +60,12 @@ class Matches:
 def match_in_time(source: Path, target: Path, group: Group) -> Matches | None:
     """Match tracks that are mutual nearest neighbours in most of the frames that both runs have.
 
-    Returns None if the runs have no frames in common.
+    The result is None if the runs have no frames in common.
 
     Parameters
     ----------
     source, target : run folders of the same recording.
-    group : maps merged tracks of the source to the same number; they are one object.
+    group : maps tracks of the source that were merged to the same number.
     """
     old, new = read_track_detections(source), read_track_detections(target)
     common = sorted(old.keys.keys() & new.keys.keys())
@@ -91,7 +92,7 @@ def _by_majority(
     counts: Counter[int],
     group: Group,
 ) -> Matches:
-    """Match each track of the target with the object of the source that most frames agree on."""
+    """Match each track of the target with the source object that it matches in most frames."""
     matches_of: dict[int, list[Match]] = {}
     reasons: dict[int, str] = {}
     claims: dict[int, dict[int, list[int]]] = {}
@@ -112,15 +113,15 @@ def _by_majority(
 
 
 def _widths(folder: Path, tracks: TrackDetections) -> F8:
-    """Return the width of each row's track (n,), metres."""
+    """Return the width (n,) of the track of each detection, metres."""
     extents = extents_of(folder, tracks)
     return np.array([extents[track][0] for track in tracks.tracks.tolist()])
 
 
 def _max_distance_at_once(a: F8, b: F8) -> F8:
-    """Return the largest distance (n, m) between detections of one object, given their widths.
+    """Return the largest distance (n, m) at which detections with these widths may be one object.
 
-    Two objects side by side are farther apart than half of their mean width.
+    It is half of their mean width, since two objects side by side are farther apart.
     """
     mean_width = (a[:, None] + b[None]) / 2
     return np.clip(_REACH * mean_width, _LEAST_REACH_M, _MOST_REACH_M)
@@ -256,7 +257,7 @@ def _place_of(row: TrackRow) -> F8:
 
 
 def _standing(folder: Path) -> tuple[list[_Standing], list[int]]:
-    """Return the tracks of a run that are at rest, and the numbers of those that moved."""
+    """Return the tracks of a run that are at rest, and the numbers of the tracks that moved."""
     tracks = read_track_detections(folder)
     extents = extents_of(folder, tracks)
     still, moved = [], []

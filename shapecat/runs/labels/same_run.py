@@ -1,4 +1,4 @@
-"""Check that a table of tracks belongs to a run: other runs number their objects differently."""
+"""Check that a table of tracks belongs to a run, since each run numbers its objects differently."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -15,8 +15,8 @@ def require_same_run(path: Path, table: TrackTable, folder: Path, *, own: bool =
 
     Parameters
     ----------
-    own : whether the table is in the folder itself, so that it needs no column ``run``. Any other
-        table without this column must have its tracks at the same positions.
+    own : whether the table is in the folder itself, so that it needs no column ``run``. A table
+        from elsewhere without this column must have its tracks at the same positions as the run.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def _number(cell: str | None) -> float | None:
 
 
 def _described(folder: Path, work: str) -> str:
-    """Return a description of a run, with its folder and recording if the folder holds it."""
+    """Describe the run with the id ``work``; name folder and recording if it is in the folder."""
     with suppress(OutputError, KeyError):
         run = read_run(folder)
         if run["work"] == work:

@@ -15,10 +15,10 @@ from shapecat.runs.tables.reading import frame_rows, misfit, numbers, opened, re
 __all__ = ["TrackDetections", "extents_of", "read_track_detections"]
 
 _SAMPLES = 40
-"""About this many detections of each track are read for its size."""
+"""Approximate number of detections of each track from which its size is computed."""
 
 _Moment = tuple[str, int, int]
-"""A frame: its topic, its stamp (ns), and its place, from 0, among the frames of this stamp."""
+"""A frame: its topic, its stamp (ns), and its index, from 0, among the frames with this stamp."""
 
 
 class TrackDetections(NamedTuple):
@@ -29,7 +29,7 @@ class TrackDetections(NamedTuple):
     tracks, numbers, detections : (n,) track, frame and detection numbers.
     frames : the `_Moment` of each detection.
     centers : (n, 3) metres, fixed frame.
-    keys : the rows of each moment.
+    keys : rows of the arrays by `_Moment`.
     """
 
     tracks: I4
@@ -71,11 +71,11 @@ def _moments(table: pa.Table) -> Iterator[_Moment]:
 
 
 def extents_of(folder: Path, tracks: TrackDetections) -> dict[int, tuple[float, float]]:
-    """Return the width and largest extent of each track, metres: medians of some views.
+    """Return the larger horizontal size and the largest size of each track: medians, metres.
 
     Raises
     ------
-    OutputError : the table of detections is unreadable, or lacks some of these.
+    OutputError : the table of detections is unreadable, or lacks detections of a track.
     """
     rows_of: dict[tuple[str, int], list[int]] = {}
     for track in np.unique(tracks.tracks):

@@ -1,7 +1,7 @@
 """tracks.csv: one line per track, to read and correct, for example in a spreadsheet.
 
-Any separator, quotes, line ends, order of columns, and numbers such as ``1.0`` are read, and other
-encodings than Unicode if the labels are ASCII.
+The table can be read as any spreadsheet saves it: with commas, semicolons or tabs, quotes, any line
+ends and order of columns, and numbers such as ``1.0``; without Unicode if the labels are ASCII.
 """
 
 import csv
@@ -27,11 +27,12 @@ __all__ = [
 ]
 
 ORIGINAL = "tracks.original.csv"
-"""The table as the run wrote it, beside tracks.csv, which a person may edit."""
+"""The table as the run wrote it. A person may edit its copy, tracks.csv."""
 LABEL_SEEN = "label_seen"
-"""The column of the table of a report page that holds the labels which the table may replace."""
+"""A column that a report page adds to its table: the labels that the page read. Only these may be
+replaced."""
 _COLUMNS = ("track", "category", "label")
-"""The columns that a table needs; ``category`` shows whether its tracks are those of the run."""
+"""The columns that a table needs. ``category`` helps to detect tables of other runs."""
 _LARGEST_TABLE = 64 << 20
 
 
@@ -53,7 +54,7 @@ class TrackRow:
 
 @dataclass(frozen=True)
 class TrackTable:
-    """The rows of a tracks.csv, and the problems of lines that are invalid or may be misread."""
+    """The rows of a tracks.csv, and the problems in its lines: invalid or perhaps misread ones."""
 
     columns: tuple[str, ...]
     rows: tuple[TrackRow, ...]
@@ -61,7 +62,7 @@ class TrackTable:
 
     @property
     def labels(self) -> dict[int, str]:
-        """The label of each track, empty without one."""
+        """The label of each track, by number; empty if it has none."""
         return {row.track: row.label for row in self.rows}
 
     @property
@@ -72,7 +73,7 @@ class TrackTable:
 
     @property
     def run(self) -> str:
-        """The ``work`` id of the run of the tracks; empty if unknown."""
+        """The ``work`` id of the run that wrote the table; empty if unknown."""
         return next(iter(self.runs), "")
 
     @property
@@ -120,7 +121,7 @@ def read_track_table(path: Path) -> TrackTable:
 
 
 def _text(path: Path) -> tuple[str, bool]:
-    """Return the text of a table, and whether it is Unicode; otherwise only ASCII is certain.
+    """Return the text of a table, and whether it is Unicode; if not, only ASCII is certain.
 
     Raises
     ------
@@ -149,7 +150,12 @@ def _separator(text: str) -> str:
 
 
 def _header(path: Path, cells: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the columns; if several have the same or none, later ones get numbers."""
+    """Return the names of the columns; repeated names, even empty ones, get a number.
+
+    Raises
+    ------
+    OutputError : a column that a tracks.csv needs is missing.
+    """
     header = [cell.strip().lower() for cell in cells]
     names = tuple(
         n if n not in header[:k] else f"{n} {k + 1}".strip() for k, n in enumerate(header)
@@ -162,7 +168,7 @@ def _header(path: Path, cells: Sequence[str]) -> tuple[str, ...]:
 
 
 def _row(line: int, cells: Mapping[str, str]) -> TrackRow | str:
-    """Return a row, or the problem of an invalid line."""
+    """Return the row in a line, or the problem of an invalid line."""
     track, confidence = (_number(cells.get(name, "")) for name in ("track", "confidence"))
     if not track.is_integer():
         return _wrong_numbers(line, cells)

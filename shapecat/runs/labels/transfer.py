@@ -25,11 +25,12 @@ __all__ = [
 
 IN_TIME, IN_PLACE = "frames in common", "places in other frames"
 TABLE_ALONE = "places in the table alone"
-"""`Transfer.by` for a table without its run: fixed frame and moved objects are unknown."""
+"""`Transfer.by` if a table was given without its run, so that fixed frame and moved objects are
+unknown."""
 
 
 class Transferred(NamedTuple):
-    """A transferred label; ``distance_m`` is the distance of the centres in the two runs."""
+    """A transferred label; ``distance_m`` is the distance between the centres of the two tracks."""
 
     old_track: int
     track: int
@@ -38,7 +39,7 @@ class Transferred(NamedTuple):
 
 
 class Missed(NamedTuple):
-    """A label that could not be transferred, and the reason; track 0 stands for invalid lines."""
+    """A label that was not transferred, and the reason; ``old_track`` is 0 for unreadable lines."""
 
     old_track: int
     label: str
@@ -49,8 +50,8 @@ class Missed(NamedTuple):
 class Transfer:
     """The outcome of a label transfer.
 
-    ``source`` is the ``work`` id of the labels' run, empty if unknown; ``by`` says how objects were
-    matched.
+    ``source`` is the ``work`` id of the run with the labels, empty if unknown; ``by`` says, in
+    words, how objects were matched.
     """
 
     source: str
@@ -69,7 +70,7 @@ class Transfer:
 
 
 def lost_labels(source: Path, reason: str) -> Transfer:
-    """Return the outcome if none of a run's labels can be transferred.
+    """Return the outcome if, for some ``reason``, no label of the run ``source`` is transferred.
 
     Raises
     ------
@@ -93,7 +94,8 @@ def transfer_labels(source: Path, target: Path) -> Transfer:
 
     Raises
     ------
-    OutputError : one of them is unreadable, or the two have different fixed frames or none.
+    OutputError : one of them is unreadable; or objects must be matched by place, but the two have
+        different fixed frames or none.
     """
     run = read_run(target)
     transfer = match_labels(source, target)
@@ -109,7 +111,7 @@ def transfer_labels(source: Path, target: Path) -> Transfer:
 
 
 def _labelled_otherwise(transfer: Transfer, target: Path, run: RunInfo) -> dict[int, str]:
-    """Return messages for tracks that have a different label, unless it is from a transfer."""
+    """Return a message for each track to which a person gave a different label."""
     earlier = {
         (item["track"], item["label"]) for item in run.get("corrections", {}).get("transferred", ())
     }
@@ -136,7 +138,7 @@ def _with_new_categories(transfer: Transfer, tracks: Container[int]) -> Transfer
 
 
 def _without(transfer: Transfer, reasons: Mapping[int, str]) -> Transfer:
-    """Return a transfer in which the labels of the given tracks are missed for these reasons."""
+    """Return a transfer without the labels of some tracks, which are missed for these reasons."""
     remaining = tuple(item for item in transfer.transferred if item.track not in reasons)
     missed = (
         Missed(item.old_track, item.label, reasons[item.track])
@@ -179,8 +181,8 @@ def match_labels(source: Path, target: Path) -> Transfer:
 def _require_complete(path: Path, table: TrackTable, *, alone: bool) -> None:
     """Check that a table has only valid lines, all from one run.
 
-    If the table is ``alone``, without the other tables of its run, its positions are used. A wrong
-    confidence then is an error, since a spreadsheet may have changed the positions, too.
+    If the table is ``alone``, without the other tables of its run, its positions are used. Then a
+    wrong confidence is an error, since a spreadsheet may have spoilt the positions, too.
 
     Raises
     ------
@@ -207,7 +209,7 @@ def _is_in_its_run(path: Path, table: TrackTable) -> bool:
 
 
 def _groups(labelled: Sequence[TrackRow]) -> Group:
-    """Return a function that maps a track to the track at the end of its merges."""
+    """Return a function that maps each track to the one with which it is finally merged."""
     partners = {row.track: merged_with(row.label) for row in labelled}
 
     def root(track: int) -> int:
@@ -229,7 +231,7 @@ def _same_recording(a: RunIdentity, b: RunIdentity) -> bool:
 def _translate(
     labelled: Sequence[TrackRow], group: Group, matches: Matches
 ) -> tuple[tuple[Transferred, ...], tuple[Missed, ...]]:
-    """Return the labels for the tracks of the target, and the labels without a match.
+    """Return the labels for tracks of the target, and the labels that match no track.
 
     A *whole* is a track that others were merged with. Its label is copied to its matches. Matches
     of the other tracks are merged with the first match of the whole.

@@ -1,4 +1,4 @@
-"""Warn if the clocks of two sensors differ: their computers are not synchronized."""
+"""Warn if the clocks of two sensors differ, since their computers are not synchronized."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,19 +10,19 @@ from shapecat.runs.tables.reading import numbers, read_by_topic
 __all__ = ["explain_clocks"]
 
 _DIFFERENT_S = 0.3
-"""Smallest difference of two clocks; the time that drivers take to log an image differs less."""
+"""Smallest difference of two clocks that causes a warning. Drivers' delays differ by less."""
 
 
 def explain_clocks(folder: Path) -> Iterator[str]:
     """Yield a warning if the sensors of a run have different clocks.
 
-    The recorder has one clock, so if the clocks of the sensors agree, the delay from the stamp of
-    an image to its log time is about the same for all of them. The difference matters only to
-    sensors that are tracked together.
+    The log times of all images are from one clock, that of the recorder. If the clocks of the
+    sensors agree, too, all have about the same delay from stamp to log time. A difference matters
+    only to sensors that are tracked together.
 
     Parameters
     ----------
-    folder : with the table of frames.
+    folder : folder with the table of frames.
     """
     delays = read_by_topic(
         folder,

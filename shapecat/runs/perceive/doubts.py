@@ -1,6 +1,7 @@
-"""Find problems that may cost a run tracks or categories.
+"""Warn about problems that may lead to missing tracks or wrong categories.
 
-These are missing planes, wrong poses, clocks that differ, and surface settings unlike in training.
+These are missing planes, wrong poses, different clocks, and surface settings that differ from those
+of training.
 """
 
 from collections.abc import Iterator, Mapping
@@ -20,11 +21,11 @@ __all__ = ["explain_doubts"]
 
 
 def explain_doubts(recording: Recording, folder: Path, run: RunInfo) -> Iterator[str]:
-    """Yield a warning for each problem that may cost the run tracks or categories.
+    """Yield a warning for each problem that may lead to missing tracks or wrong categories.
 
     Parameters
     ----------
-    folder : with the tables of the perceived frames.
+    folder : folder with the tables of the perceived frames.
     """
     yield from _explain_surfaces(run["settings"]["surface"])
     yield from explain_missing_planes(recording, folder, run)
@@ -36,7 +37,7 @@ def explain_doubts(recording: Recording, folder: Path, run: RunInfo) -> Iterator
 
 
 def _explain_surfaces(settings: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a warning if surface settings differ from the defaults, which all training uses."""
+    """Yield a warning if surface settings differ from the defaults, which all models assume."""
     changed = [
         f"surface.{name}"
         for name, value in asdict(SurfaceSettings()).items()

@@ -1,4 +1,4 @@
-"""Warn if the poses of a sensor are worse than none, for example if its mount is wrong."""
+"""Warn if the poses of a sensor are worse than none, for example if its extrinsics are wrong."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,17 +19,18 @@ from shapecat.runs.tables.reading import (
 __all__ = ["explain_misplacement"]
 
 _APART_S = 0.3
-"""Minimum time between two frames that are compared: even a slow camera must have moved."""
+"""Minimum time between two compared frames, so that even a slow camera has moved."""
 _GAP_S = 2.0
-"""Maximum time between them: the camera must see the same objects."""
+"""Maximum time between two compared frames, so that they show the same objects."""
 _MOVED_M = 0.03
 """The camera has moved if objects have moved farther than this relative to it."""
 _WORSE = 1.5
-"""Poses are worse than none if objects move this many times as far as relative to the camera."""
+"""Poses are worse than none if objects move more than this many times as far in the fixed frame as
+relative to the camera."""
 _MIN_MOTIONS = 5
 """Minimum number of comparisons on which a warning is based."""
 _WORSE_SHARE = 0.7
-"""Minimum fraction of them in which poses are worse than none."""
+"""Minimum fraction of the comparisons in which poses are worse than none."""
 
 
 class _Centers(NamedTuple):
@@ -41,11 +42,11 @@ class _Centers(NamedTuple):
 
 
 def explain_misplacement(folder: Path, fixed_frame: str) -> Iterator[str]:
-    """Yield a warning for each topic whose objects move more in the fixed frame than without it.
+    """Yield a warning for each topic whose objects move farther in the fixed than the sensor frame.
 
     Parameters
     ----------
-    folder : with the tables of frames and detections.
+    folder : folder with the tables of frames and detections.
     fixed_frame : name of the frame of ``center_fixed``.
     """
     for topic, worse in _compare(folder).items():
@@ -61,7 +62,7 @@ def explain_misplacement(folder: Path, fixed_frame: str) -> Iterator[str]:
 
 
 def _compare(folder: Path) -> dict[str, list[bool]]:
-    """Return, for each topic, whether poses are worse than none, in each motion of its camera.
+    """Return, for each topic and each motion of its camera, whether poses are worse than none.
 
     They are if objects move much farther in the fixed frame than relative to the sensor.
     """
@@ -95,6 +96,6 @@ def _compare(folder: Path) -> dict[str, list[bool]]:
 
 
 def _moved_m(previous: F8, current: F8) -> float:
-    """Return the median distance of objects (n, 3) from the nearest ones (m, 3) before, metres."""
+    """Return the median distance of objects (n, 3) to the nearest previous ones (m, 3), metres."""
     distances = np.linalg.norm(current[:, None] - previous, axis=2)
     return float(np.median(distances.min(axis=1)))

@@ -17,17 +17,17 @@ from shapecat.types import Frame
 __all__ = ["explain_missing_planes"]
 
 _NO_ROOM_M = 10.0
-"""A median depth that no indoor camera measures: the unit is wrong, not the range."""
+"""If the median depth is larger, its unit is wrong rather than the range, as rooms are smaller."""
 
 _OBJECT_M = 0.6
-"""All points of a frame within this length may be a single object."""
+"""If all points of a frame are within this length, they may be a single object."""
 _CUT_OUT = (
     f"; all points are within {_OBJECT_M:g} m: if they are a single object, cut out of its scene, "
     "shapecat also needs the points of the table below it"
 )
 
 _FRAMES = 3
-"""Number of frames without a plane whose depths are examined."""
+"""Maximum number of frames without a plane whose depths are examined."""
 
 
 def explain_missing_planes(recording: Recording, folder: Path, run: RunInfo) -> Iterator[str]:
@@ -35,7 +35,7 @@ def explain_missing_planes(recording: Recording, folder: Path, run: RunInfo) -> 
 
     Parameters
     ----------
-    folder : with the tables of frames, planes and detections.
+    folder : folder with the tables of frames, planes and detections.
     run : its options select the frames; its settings have the range of detection.
     """
     range_m = run["settings"]["detection"]["max_range_m"]
@@ -53,9 +53,10 @@ def explain_missing_planes(recording: Recording, folder: Path, run: RunInfo) -> 
 
 
 def _reason(distances: Sequence[F4], range_m: float, source: str) -> str:
-    """Return the likely reason why frames have no plane, given their distances (n,), metres.
+    """Return the likely reason why frames have no plane.
 
-    ``source`` is the source of the up direction.
+    ``distances`` holds those (n,) of the points in each frame, metres; ``source`` is the source of
+    the up direction.
     """
     if not distances:
         return "they have no valid depth"
@@ -76,9 +77,9 @@ def _reason(distances: Sequence[F4], range_m: float, source: str) -> str:
 
 
 def _count(folder: Path) -> tuple[int, int, set[Key]]:
-    """Return the number of frames, of those without a plane, and the first few of the latter.
+    """Return the number of frames, the number without a plane, and the first few of these.
 
-    A frame with objects has a plane, even if it is only assumed and not in the table.
+    A frame with objects counts as one with a plane, which may be assumed and not in the table.
     """
     count, bare, first = 0, 0, list[Key]()
     tables = dict.fromkeys(("frames", "planes", "detections"), ("topic", "frame"))
@@ -102,7 +103,7 @@ def _distances(frame: Frame) -> F4:
 
 
 def _extent_m(frame: Frame) -> float:
-    """Return the longest side of the box around all points, along the axes of the sensor."""
+    """Return the longest side of the box around all points, along the sensor's axes, metres."""
     points = frame.xyz()
     valid = points[np.isfinite(points).all(axis=1)]
     with np.errstate(over="ignore"):

@@ -1,4 +1,4 @@
-"""The tables of perceive: frames, detections, planes and masks, written in segments."""
+"""Write the tables of perceived frames: frames, detections, planes and masks, in segments."""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -30,18 +30,20 @@ from shapecat.types import Perception, Pose
 __all__ = ["FrameRow", "PerceptionTables"]
 
 _SEGMENT_S = 2.0
-"""Frames are written to a segment at least this often, to limit what a kill may cost."""
+"""A segment is written if this time has passed since the last one, to limit the cost of a kill."""
 _SEGMENT_FRAMES = 2 * GROUP_FRAMES
-"""Frames are written to a segment when this many are waiting."""
+"""A segment is written if at least this many frames are waiting."""
 
 
 @dataclass(frozen=True)
 class FrameRow:
     """Values of the frames table that a `Perception` lacks.
 
-    ``up_given`` is (3,), a unit vector in the sensor frame, None if estimated from planes;
-    ``again`` marks a frame that is perceived for the second time; ``frame_from_sensor`` is as in
-    `Frame`.
+    Attributes
+    ----------
+    up_given : (3,) up direction in the sensor frame, a unit vector; None if estimated from planes.
+    again : whether the frame is perceived for the second time.
+    frame_from_sensor : as in `Frame`.
     """
 
     log_time_ns: int
@@ -54,11 +56,11 @@ class FrameRow:
 class PerceptionTables:
     """Writes the tables of frames, detections, planes and masks.
 
-    Frames are first written as *segments*, folders that appear when complete, so that an
-    interrupted run resumes after its last segment. Leaving the block joins the segments into
-    tables, which do not depend on where a run was interrupted. Frames that are perceived a second
-    time (`shapecat.runs.perceive.second_look`) have segments of their own, and replace the earlier
-    results when the tables are joined.
+    Use it as a context manager. Frames are first written as *segments*, folders that appear when
+    they are complete, so that an interrupted run resumes after its last segment. Leaving the block
+    joins the segments into tables, which do not depend on where a run was interrupted. Frames that
+    are perceived a second time (`shapecat.runs.perceive.second_look`) have segments of their own,
+    and replace the earlier results when the tables are joined.
 
     Attributes
     ----------
@@ -74,9 +76,13 @@ class PerceptionTables:
         colour: bool = False,
         again: bool = False,
     ) -> None:
-        """Find the segments in ``folder``; if ``again``, the segments of the second look.
+        """Find the segments in ``folder``.
 
-        Without ``colour``, no table of masks is written.
+        Parameters
+        ----------
+        categories, model_id : of the model, stored in the tables.
+        colour : whether to write a table of masks.
+        again : whether the frames are perceived for the second time.
         """
         metadata = {
             "schema_version": SCHEMA_VERSION,
@@ -107,7 +113,7 @@ class PerceptionTables:
         self._join()
 
     def write(self, perceptions: Sequence[Perception], rows: Sequence[FrameRow]) -> None:
-        """Append a block of frames, all to the same segment."""
+        """Append a block of frames, which are never split between segments."""
         self._pending.extend(zip(perceptions, rows, strict=True))
         late = time.monotonic() - self._flushed > _SEGMENT_S
         if late or len(self._pending) >= _SEGMENT_FRAMES:
@@ -132,7 +138,7 @@ class PerceptionTables:
         self._flushed = time.monotonic()
 
     def _join(self) -> None:
-        """Write the tables; their row groups cover the same frames."""
+        """Join the segments into tables, whose row groups cover the same frames."""
         place = self._folder / SEGMENTS
         frames = sum(read_segment(s, "frames").num_rows for s in list_segments(place))
         with ExitStack() as stack:

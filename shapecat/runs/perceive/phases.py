@@ -1,4 +1,4 @@
-"""The expensive phases: perceive every frame, then revise some with a better up direction."""
+"""Run the expensive phases: perceive all frames, then revise some with a better up direction."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -34,14 +34,14 @@ from shapecat.types import Frame
 __all__ = ["Work", "perceive_all", "revise"]
 
 _MANY = 100
-"""With at least this many frames, other processes are started before anything is read."""
+"""With at least this many frames, the other processes are started before any frame is read."""
 
 _Item = tuple[FrameRow, PerceptionInput]
-"""A frame to perceive, and the values of its row that a `Perception` lacks."""
+"""The values of a frame's row that its `Perception` lacks, and the frame to perceive."""
 
 
 class Work(NamedTuple):
-    """A job with its open recording and its streams, the folder of its tables, and run.json."""
+    """A job with its open recording and streams, the folder of its tables, and its run.json."""
 
     recording: Recording
     streams: tuple[Stream, ...]
@@ -56,6 +56,8 @@ class Work(NamedTuple):
 
 def perceive_all(work: Work) -> None:
     """Perceive every frame in constant memory; write frames, detections, planes and masks.
+
+    The counts, the up direction and the warnings are stored in ``work.run``.
 
     Raises
     ------
@@ -95,8 +97,8 @@ def perceive_all(work: Work) -> None:
 def revise(work: Work) -> None:
     """Perceive again the frames that disagree with the rest, and rewrite the tables.
 
-    An up direction that the user gave is never revised. A frame keeps its first result if the
-    second look finds nothing.
+    An up direction that the user gave is never revised. A frame keeps its first result if it shows
+    neither a plane nor an object with the new up direction.
     """
     folder, run = work.folder, work.run
     chosen = frames_to_revise(read_segments(folder)) if run["up"]["source"] != "option" else {}
@@ -136,8 +138,8 @@ def _perceiving(
 
     Yields
     ------
-    A function that perceives frames and writes them, except those that an interrupted run has
-    written. It returns the number of all frames, and of those that were written before.
+    A function that perceives frames and writes the results, except for frames that an interrupted
+    run has written. It returns the number of all frames, and the number written before.
     """
     job, categorizer = work.job, work.categorizer
     perceiver = Perceiver(categorizer, job.settings, job.model)
@@ -174,7 +176,7 @@ def _perceiving(
 def _blocks(
     views: Iterator[_Item], size: int
 ) -> Iterator[tuple[tuple[FrameRow, ...], tuple[PerceptionInput, ...]]]:
-    """Yield blocks of ``size`` frames, the same in every run, until asked to stop."""
+    """Yield blocks of ``size`` frames until asked to stop; these are the same in every run."""
     while not stopping.asked() and (block := tuple(islice(views, size))):
         rows, perceptions = zip(*block, strict=True)
         yield rows, perceptions
@@ -193,7 +195,7 @@ def _oriented(work: Work, upright: Upright, skipped: Counter[str]) -> Iterator[O
 
 
 def _readings(work: Work, skipped: Counter[str]) -> Iterator[tuple[Frame, ColourView | None]]:
-    """Yield the frames of a run."""
+    """Yield the frames of a run, with their colour images or None."""
     for frame, colour in read_frames(
         work.recording,
         work.run["options"],

@@ -1,4 +1,4 @@
-"""Warn if the pose of a sensor jumps in the fixed frame, as when localization corrects a map."""
+"""Warn if the pose of a sensor jumps in the fixed frame, as after a correction by localization."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,9 +12,9 @@ from shapecat.runs.tables.reading import first_stamp, numbers, numbers_or_nan, r
 __all__ = ["explain_jumps"]
 
 _JUMP_M = 0.1
-"""Minimum distance of a jump: the tracker follows objects over shorter ones."""
+"""Minimum distance of a jump. The tracker can follow objects over shorter ones."""
 _JUMP_M_S = 2.0
-"""Minimum speed of a jump: cameras of robots indoors are slower."""
+"""Minimum speed of a jump. Cameras of indoor robots are slower."""
 _SUDDEN = 5
 """A jump is this many times as fast as the motion before and after it."""
 
@@ -24,7 +24,7 @@ def explain_jumps(folder: Path, fixed_frame: str) -> Iterator[str]:
 
     Parameters
     ----------
-    folder : with the table of frames.
+    folder : folder with the table of frames.
     """
     stamps = read_by_topic(folder, ["stamp_ns"], lambda frames: numbers(frames["stamp_ns"]))
     poses = read_by_topic(folder, ["fixed_translation", "fixed_rotation"], _places)
@@ -49,7 +49,7 @@ def _places(frames: pa.Table) -> F8:
 
 
 def _jumps(places: F8, stamps_ns: I4) -> tuple[I4, F8]:
-    """Return the indices (k,) of the positions (n, 3) before a jump, and the distances (k,)."""
+    """Return indices (k,) of the positions (n, 3) before a jump, and its distance (k,), metres."""
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     seconds = np.diff(stamps_ns) * 1e-9
     speeds = np.divide(steps, seconds, out=np.zeros_like(steps), where=seconds > 0)

@@ -19,13 +19,13 @@ from shapecat.system.files import partial_path
 __all__ = ["has_work", "require_resumable", "resume", "take_over_frames"]
 
 _LATER = ("tracking.", "outputs.")
-"""Groups of settings that perceiving does not use."""
+"""Prefixes of settings that do not affect the perceived frames."""
 
 
 def require_resumable(job: Job, planned: RunInfo, digest: Callable[[], str]) -> None:
     """Check that a job would not discard an interrupted run of other input, model or settings.
 
-    Frames of other versions, or of a recording that has changed, are not worth keeping.
+    Runs of other versions, or of a recording that has changed since, may be discarded.
 
     Parameters
     ----------
@@ -55,16 +55,22 @@ def require_resumable(job: Job, planned: RunInfo, digest: Callable[[], str]) -> 
 
 
 def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]) -> RunInfo:
-    """Return the run.json of the interrupted run in a folder if ``planned`` can continue it.
+    """Continue the interrupted run in a folder, or clear the folder to begin anew.
 
-    That is possible if settings, options, model, versions and recording are the same, and its
-    files are whole. If settings of tracking or of outputs differ, the frames are kept. Otherwise
-    clear the folder, write ``planned`` as its run.json and return ``planned``.
+    The run is continued if its files are complete, and its settings, options, model, versions and
+    recording are those of ``planned``. If only settings of tracking or of outputs differ, just its
+    frames are kept.
 
     Parameters
     ----------
+    planned : run.json of the planned run.
+    source : path of the recording.
     digest : returns the digest of the recording; called only if names, sizes or times of its files
         differ.
+
+    Returns
+    -------
+    The run.json of the continued run; or ``planned``, which is then written to the folder.
 
     Raises
     ------
@@ -92,13 +98,14 @@ def take_over_frames(
 ) -> RunInfo:
     """Take over the perceived frames of a finished run that differs only in later phases.
 
-    That is possible if settings of tracking or of outputs differ, but nothing else. If nothing
-    differs, the user wants everything computed again. The tables are linked or copied.
+    Its frames are used, by links to its tables or copies, if settings of tracking or of outputs
+    differ, but nothing else. If nothing differs, the user wants everything computed again.
 
     Parameters
     ----------
     finished : the folder of the finished run, which need not exist.
     folder : the folder of the new run, whose run.json has the content ``planned``.
+    source, digest : as for `resume`.
 
     Returns
     -------
@@ -124,7 +131,7 @@ def take_over_frames(
 
 
 def has_work(folder: Path) -> bool:
-    """Return whether an interrupted run has anything to resume."""
+    """Return whether the folder of an interrupted run holds perceived frames."""
     with suppress(OutputError):
         return bool(list_segments(folder / SEGMENTS)) or "perceive" in read_run(folder)["seconds"]
     return False
@@ -137,7 +144,7 @@ def _perception_differences(run: RunInfo, planned: RunInfo) -> dict[str, str]:
 
 
 def _with_perceived(planned: RunInfo, run: RunInfo) -> RunInfo:
-    """Return ``planned`` with the results of perceiving from another run."""
+    """Return ``planned`` with the entries that perceiving sets, from another run."""
     new, counts, seconds = planned.copy(), run["counts"].copy(), run["seconds"]
     counts.pop("tracks", None)
     if "perceive" in seconds:
@@ -164,7 +171,7 @@ def _require_complete(folder: Path) -> None:
 
 
 def _with_outputs(run: RunInfo, planned: RunInfo) -> RunInfo:
-    """Return a run whose options ask for the outputs of ``planned``."""
+    """Set the options for outputs in ``run`` to those in ``planned``; return ``run``."""
     for name in OUTPUT_OPTIONS:
         run["options"][name] = planned["options"][name]
     return run
@@ -181,7 +188,7 @@ def _same_recording_and_versions(
 
 
 def _is_complete(folder: Path, run: RunInfo) -> bool:
-    """Return whether both phases are done and the tables have all rows of the counts."""
+    """Return whether *perceive* and *revise* are done and the tables have all counted rows."""
     counts = run["counts"]
     return (
         {"perceive", "revise"} <= run["seconds"].keys()

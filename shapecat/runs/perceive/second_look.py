@@ -1,8 +1,8 @@
 """Choose the frames to perceive again with the up direction of the whole recording.
 
-If the sensor poses are known, all frames have the same up direction in the fixed frame. If they are
-unknown and the frames before and after a frame agree with each other, the camera is assumed to be
-at rest, and the up direction of these frames is used.
+If the sensor poses are known, all frames have the same up direction in the fixed frame. If not,
+the camera is assumed to be at rest when the frames before and after a frame agree with each other;
+their up direction is then used.
 """
 
 from collections.abc import Iterable, Iterator
@@ -25,21 +25,21 @@ from shapecat.runs.tables.reading import (
 __all__ = ["Revision", "frames_to_revise"]
 
 _OFF_DEG = 10.0
-"""A frame is revised if its up direction differs by more from the recording's."""
+"""A frame is revised if its up direction is off by more than this from that of the recording."""
 _AGREES_DEG = 5.0
-"""A frame is not revised if the given up direction differs by less from the recording's."""
+"""A frame is not revised if its given up direction is off by less than this."""
 _STILL_SHARE = 0.6
 """The camera is at rest if more than this fraction of the nearby frames agree."""
 _STILL_DEG = 3.0
 """Largest angle between the up directions of frames that agree."""
 _FIXED_SHARE = 0.5
-"""Up is known in the fixed frame if more than this fraction of the frames agree to `_OFF_DEG`."""
+"""Up is known in the fixed frame if more than this fraction of frames agree within `_OFF_DEG`."""
 _AROUND = 30
-"""Maximum number of nearby frames before a frame, and after it."""
+"""Maximum number of nearby frames before a frame, and likewise after it."""
 _AROUND_NS = 3_000_000_000
 """Maximum time between a frame and a nearby one."""
 _FEWEST = 4
-"""With fewer frames to compare, nothing is decided."""
+"""Minimum number of frames to compare a frame with; with fewer, it is not revised."""
 _STILL_M = 0.03
 """Largest change of the height of a support below a camera at rest, metres."""
 _OFF_M = 0.08
@@ -64,7 +64,7 @@ class _Stream(NamedTuple):
     up : (n, 3) up directions in the sensor frame.
     given : (n, 3) up directions from other sources than planes; NaN if there is none.
     rotation : (n, 3, 3) of ``fixed_from_sensor``; NaN if unknown.
-    offsets : of each frame's planes along its up direction, ascending, metres.
+    offsets : plane offsets of each frame along its up direction, ascending, metres.
     """
 
     frames: I4
@@ -81,7 +81,7 @@ class _Stream(NamedTuple):
 
 
 def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, Revision]:
-    """Return the frames without a plane, or with one that disagrees with the recording.
+    """Choose the frames without a plane, or with planes that disagree with the recording.
 
     Parameters
     ----------
@@ -89,11 +89,11 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
 
     Returns
     -------
-    The frames for which a better up direction is now known, in their order.
+    For each frame for which a better up direction is now known, how to revise it.
 
     Notes
     -----
-    Memory holds a few numbers per frame.
+    This keeps a few numbers per frame in memory.
     """
     revisions: dict[Key, Revision] = {}
     for topic, stream in _streams(tables).items():
@@ -110,14 +110,17 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
 
 
 def _fixed_up(stream: _Stream, posed: Bool) -> F8:
-    """Return the up directions (n, 3) if most frames agree on one in the fixed frame; else NaN."""
+    """Return, in each sensor frame, the up direction (n, 3) on which most agree in the fixed frame.
+
+    It is NaN if they do not agree, and in frames without a pose.
+    """
     in_fixed = np.einsum("nij,nj->ni", stream.rotation, stream.up)
     agreed = _agreed(in_fixed[posed & stream.level], _OFF_DEG, _FIXED_SHARE)
     return np.asarray(np.einsum("nji,j->ni", stream.rotation, agreed))
 
 
 def _still_up(stream: _Stream) -> F8:
-    """Return the up directions (n, 3) of nearby frames if the camera was at rest; else NaN."""
+    """Return, for each frame, the up direction of nearby frames (n, 3); NaN if the camera moved."""
     level, expected = stream.level, np.full(stream.up.shape, np.nan)
     for k in range(len(expected)):
         neighbours = _around(stream, k)
@@ -133,9 +136,9 @@ def _around(stream: _Stream, k: int) -> I4:
 
 
 def _other_support(stream: _Stream, off: Bool) -> Bool:
-    """Return whether all planes of a frame differ in height from the lowest ones of nearby frames.
+    """Return which frames (n,) have no plane at the height of the lowest one of nearby frames.
 
-    ``off`` (n,) marks the frames that are not compared; the result is (n,) too.
+    ``off`` (n,) marks the frames that are not compared.
     """
     is_other = np.zeros(len(off), np.bool_)
     for k in np.flatnonzero(~off):
@@ -150,7 +153,7 @@ def _other_support(stream: _Stream, off: Bool) -> Bool:
 
 
 def _agreed(up: F8, within_deg: float, share: float) -> F8:
-    """Return the direction (3,) on which more than `share` of ``up`` (n, 3) agree; NaN if none."""
+    """Return the direction (3,) on which more than ``share`` of the ``up`` (n, 3) agree, or NaN."""
     if len(up) < _FEWEST:
         return np.full(3, np.nan)
     inliers = _cosine(up, np.median(up, axis=0)) > _cos(within_deg)

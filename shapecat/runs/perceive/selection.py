@@ -1,4 +1,4 @@
-"""The frames of a recording that the options of a run select."""
+"""Read the frames of a recording that the options of a run select."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +28,7 @@ def read_frames(
 
     Parameters
     ----------
-    streams, colours : the selected streams, and the colour stream of each; found by default.
+    streams, colours : the selected streams, and the colour stream of each topic; None to find them.
     skipped, needed : as for `shapecat.recordings.frames`.
     same_images : as for `frames_with_colour`.
 

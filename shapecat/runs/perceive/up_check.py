@@ -1,6 +1,6 @@
 """Compare the up direction that a recording gives with the planes in its first frames.
 
-A fixed frame whose z axis is not up would spoil all frames.
+Otherwise a fixed frame whose z axis is not up would spoil all frames.
 """
 
 from collections import Counter
@@ -26,17 +26,17 @@ __all__ = ["Oriented", "UpCheck"]
 _CONFIRMS_DEG = 15.0
 """A plane confirms an up direction within this angle, as in `detect`."""
 _MISNAMED_DEG = 5.0
-"""A plane confirms other axes within this angle: the transforms of simulators are exact, but those
-of visual SLAM, whose map has z forward, fit other axes up to the pitch of its camera."""
+"""A plane confirms a `Misnaming` within this angle, since transforms of simulators are exact. A
+larger angle would also accept maps of visual SLAM with z forward, off by the camera's pitch."""
 _DOUBTS = 3
-"""Number of frames with a plane that must contradict the up direction."""
+"""Number of frames with a plane that must contradict an up direction to reject it."""
 _LOOKS = 10
-"""Maximum number of frames that are checked."""
+"""Maximum number of frames of a topic that are checked."""
 _MOST_HELD = 64
-"""Frames that are held back at most: a topic may have few frames, or none for a long time."""
+"""Maximum number of frames held back, since a topic may have few frames or begin late."""
 
 Oriented = tuple[Frame, ColourView | None, Orientation]
-"""A frame, its colour image, if it has one, and the up direction and pose of the sensor."""
+"""A frame, its colour image or None, and the up direction and pose of the sensor."""
 
 
 class UpCheck:
@@ -53,7 +53,7 @@ class UpCheck:
     def before(self, source: Iterator[Oriented]) -> Iterator[Oriented]:
         """Yield all frames, but hold the first ones back until the up directions are decided.
 
-        Only topics with a given up direction are waited for.
+        Topics without a given up direction need no decision.
         """
         pending: list[Oriented] = []
         for oriented in source:
@@ -70,6 +70,7 @@ class UpCheck:
         yield from pending
 
     def _look(self, frame: Frame, orientation: Orientation) -> None:
+        """Compare the up direction of a frame with its planes; decide if enough were compared."""
         self._looks[frame.topic] += 1
         hint, off = orientation.up, self._off_deg.get(frame.topic, [])
         elsewhere = frame.points is not None and has_z_up(frame.frame_id)
@@ -100,7 +101,10 @@ class UpCheck:
             self._decide(topic)
 
     def _decide(self, topic: str) -> None:
-        """Reject the up direction of a topic if no frame confirms it and enough contradict it."""
+        """Reject the up direction of a topic if no frame confirms it and enough contradict it.
+
+        If it fits a `Misnaming`, it is corrected instead.
+        """
         self._decided.add(topic)
         off = self._off_deg.get(topic, [])
         enough = len(off) >= min(_DOUBTS, self._looks[topic])

@@ -1,4 +1,4 @@
-"""Where the up direction of a run came from, and how well the planes confirm it."""
+"""Report the source of a run's up direction, and its agreement with the planes."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +23,7 @@ def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
 
     Parameters
     ----------
-    folder : with the tables of frames, planes and detections.
+    folder : folder with the tables of frames, planes and detections.
     """
     if upright.failed:
         upright.warnings.append(
@@ -66,8 +66,8 @@ def _angles_to_planes(folder: Path) -> tuple[list[float], int]:
 
     Returns
     -------
-    The angle between the two in each frame, degrees; and the number of frames that have a given up
-    direction, but neither a plane nor an object, which implies one.
+    The angle between the two in each frame with a plane, degrees; and the number of frames that
+    have a given up direction, but neither a plane nor an object, which implies a plane.
     """
     angles, bare = [], 0
     rows = ["topic", "frame"]

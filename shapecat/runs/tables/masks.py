@@ -1,4 +1,4 @@
-"""The table of masks: the pixels of each detection on the colour image."""
+"""Read the table of masks, the pixels of detections on colour images; make its columns."""
 
 from collections.abc import Iterable, Iterator
 from itertools import chain, pairwise
@@ -16,11 +16,11 @@ from shapecat.types import ImageMasks, Perception
 __all__ = ["mask_columns", "read_masks", "read_nearest_masks"]
 
 _HELD = 256
-"""Images that are held back for the frames of a sensor that come later."""
+"""Maximum number of images held back, since a later frame may be nearer to them in time."""
 
 
 def mask_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
-    """Return the columns of the table for some frames."""
+    """Return the columns of the masks table for some frames."""
     pairs = [(p, p.masks) for p in perceptions if p.masks is not None]
     return {
         "topic": [p.topic for p, _ in pairs],
@@ -38,9 +38,9 @@ def mask_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
 
 
 def read_masks(folder: Path, *, boxes_only: bool = False) -> Iterator[tuple[Key, ImageMasks]]:
-    """Yield frames with a colour image and their masks, in the order of the frames table.
+    """Yield each frame that has a colour image, and its masks, in the order of the frames table.
 
-    ``boxes_only`` leaves out the run lengths, which make up most of the table.
+    With ``boxes_only``, the masks lack run lengths, which make up most of the table.
     """
     path = folder / "masks.parquet"
     if not path.exists():
@@ -59,11 +59,11 @@ def read_masks(folder: Path, *, boxes_only: bool = False) -> Iterator[tuple[Key,
 
 
 def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
-    """Yield each image once, with the boxes of the masks of the frame nearest to it in time.
+    """Yield each colour image once: the frame nearest to it in time, and the masks of this frame.
 
     Images are in the order in which they were recorded. Several frames share an image if there are
-    fewer images than frames, or if several depth sensors share a colour camera; the frames of one
-    sensor may come later than those of another. Run lengths are left out.
+    fewer images than frames, or if several depth sensors share a colour camera. The masks have
+    boxes, but no run lengths.
 
     Raises
     ------

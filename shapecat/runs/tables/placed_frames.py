@@ -27,7 +27,7 @@ class DetectedFrames:
     Attributes
     ----------
     first : (f,) row of the first detection of each frame, ascending.
-    poses : (f, 3, 4) ``fixed_from_sensor``, metres; the identity if not known or not used.
+    poses : (f, 3, 4) ``fixed_from_sensor``, metres; the identity if unknown or not used.
     """
 
     first: I4
@@ -35,7 +35,7 @@ class DetectedFrames:
 
     @classmethod
     def read(cls, folder: Path, placed: Collection[str]) -> "DetectedFrames":
-        """Read the frames of a run; the topics ``placed`` are tracked in the fixed frame."""
+        """Read the frames of a run; use only the poses of the topics in ``placed``."""
         columns = ("topic", "frame", "fixed_translation", "fixed_rotation")
         tables = {"frames": columns, "detections": ("topic", "frame")}
         first: list[I4] = [np.zeros(0, np.int64)]
@@ -50,11 +50,11 @@ class DetectedFrames:
         return cls(np.concatenate(first), np.concatenate(poses))
 
     def poses_of(self, rows: I4) -> F8:
-        """Return the ``poses`` (n, 3, 4) for the detections in table rows ``rows`` (n,)."""
+        """Return the ``poses`` (n, 3, 4) for detections, given their table rows (n,)."""
         return np.asarray(self.poses[self._find(rows)])
 
     def numbers_of(self, rows: I4) -> I4:
-        """Return the numbers (n,), in their frames, of the detections in table rows (n,)."""
+        """Return the numbers (n,) of detections in their frames, given their table rows (n,)."""
         return np.asarray(rows - self.first[self._find(rows)])
 
     def _find(self, rows: I4) -> I4:
@@ -75,13 +75,13 @@ def _poses(frames: pa.Table, placed: Collection[str]) -> F8:
 def streams_with_poses(folder: Path) -> set[str]:
     """Return the topics whose sensor pose in the fixed frame is known in most frames.
 
-    Their detections in the other frames are not tracked.
+    Detections of these topics in frames without a pose are not tracked.
     """
     return {topic for topic, (known, count) in count_poses(folder).items() if 2 * known > count}
 
 
 def count_poses(folder: Path) -> dict[str, tuple[int, int]]:
-    """Return, for each topic, the numbers of frames with a known sensor pose, and of all frames."""
+    """Return, by topic, the number of frames with a known sensor pose and that of all frames."""
     has_pose = read_by_topic(
         folder,
         ["fixed_translation"],

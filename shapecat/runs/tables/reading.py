@@ -1,7 +1,7 @@
 """Read the Parquet tables of a run folder.
 
-Row groups of all tables but ``tracks`` cover the same frames, so that they can be read side by side
-in constant memory.
+The row groups of all tables but ``tracks`` cover the same frames, so that these tables can be read
+side by side in constant memory.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -41,7 +41,7 @@ __all__ = [
 _NUMBERS = {"center", "size", "orientation", "posterior", *FULL_BOX}
 """Columns whose numbers are finite."""
 _TUPLES = {"edges": 2, "neurons": 3, "outline": 3}
-"""Columns of lists of this many numbers for each item."""
+"""Columns with flat lists, and the number of values of each item in these."""
 
 Key = tuple[str, int]
 """A frame: its topic, and its number on that topic."""
@@ -59,9 +59,9 @@ def count_rows(folder: Path, table: str) -> int:
 
 
 def first_stamp(folder: Path) -> int:
-    """Return the earliest stamp of the frames of a run, ns; 0 without frames.
+    """Return the earliest stamp of the frames of a run, ns; 0 if there are none.
 
-    It may be in a later row than the first: frames are in the order in which they were recorded.
+    It need not be that of the first frame, since frames are in the order of recording.
     """
     groups = read_row_groups(folder / "frames.parquet", ["stamp_ns"])
     return min((int(numbers(group["stamp_ns"]).min()) for group in groups if len(group)), default=0)
@@ -80,8 +80,8 @@ def read_by_topic(
 
     Parameters
     ----------
-    columns : the columns to read, in addition to the topic.
-    values : called with some rows of these columns; returns an array with one row for each.
+    columns : the columns to read.
+    values : function of a table with these columns; returns an array with an item for each row.
     """
     parts: dict[str, list[Any]] = {}
     for group in read_row_groups(folder / "frames.parquet", ["topic", *columns]):
@@ -112,7 +112,7 @@ def read_row_groups(
 def read_rows(
     file: pq.ParquetFile, columns: Sequence[str], rows: I4, *, at_once: int = 1
 ) -> Iterator[tuple[I4, pa.Table]]:
-    """Yield some rows of an open table, ``at_once`` row groups in memory at a time.
+    """Yield some rows of an open table, from at most ``at_once`` row groups at a time.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def read_rows(
 
     Yields
     ------
-    Indices (k,) in ``rows``, and the table of these rows.
+    Indices (k,) into ``rows``, and a table of the rows at these indices.
     """
     sizes = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
     starts, rows = np.cumsum([0, *sizes]), rows.astype(np.int64)
@@ -140,7 +140,7 @@ def read_together(
 ) -> Iterator[tuple[pa.Table, ...]]:
     """Yield the row groups of the same frames from several tables of a run folder.
 
-    ``columns`` are those to read of each table, by its name; None for all.
+    ``columns`` holds the columns to read by name of the table; None reads all of them.
 
     Raises
     ------
@@ -159,7 +159,7 @@ def read_together(
 
 
 def misfit(folder: Path) -> OutputError:
-    """Return the error that rows of a run's tables refer to rows that are not there."""
+    """Return the error for tables of a run whose rows refer to missing rows of other tables."""
     problem = "its tables are inconsistent, as if from different runs"
     msg = f"{folder}: {problem}; process the recording again"
     return OutputError(msg)
@@ -176,7 +176,7 @@ def frame_rows(table: pa.Table) -> dict[Key, slice]:
 
 
 def topic_codes(table: pa.Table) -> tuple[list[str], I4]:
-    """Return the topics in a table, and the index of each row's topic, (rows,)."""
+    """Return the topics in a table, and for each row the index of its topic, (rows,)."""
     column = table["topic"].combine_chunks().dictionary_encode()
     codes: I4 = column.indices.to_numpy()
     return column.dictionary.to_pylist(), codes
@@ -187,8 +187,8 @@ def rows_of(topics: Sequence[str], codes: I4, frames: I4) -> dict[Key, slice]:
 
     Parameters
     ----------
-    codes : (rows,) index of each row's topic.
-    frames : (rows,) number of each row's frame.
+    codes : (rows,) index in ``topics`` of the topic of each row.
+    frames : (rows,) frame number of each row.
     """
     changes = (np.diff(codes) != 0) | (np.diff(frames) != 0)
     starts = np.flatnonzero(np.concatenate([np.ones(min(1, len(frames)), np.bool_), changes]))
@@ -294,7 +294,7 @@ def _open_parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
 
 
 def _wrong_column(schema: pa.Schema, expected: pa.Schema, columns: Sequence[str] | None) -> str:
-    """Describe the first column that another version, or another program, wrote otherwise."""
+    """Describe the first column that is missing or has an unexpected type; empty if none is."""
     for field in (field for field in expected if columns is None or field.name in columns):
         if field.name not in schema.names:
             return f"no column {field.name}"
@@ -306,6 +306,6 @@ def _wrong_column(schema: pa.Schema, expected: pa.Schema, columns: Sequence[str]
 
 
 def _file_types(kind: pa.DataType) -> tuple[pa.DataType, ...]:
-    """Return the types that a column may have in a file: lists with nulls have no fixed size."""
+    """Return the types that a column may have in a file. Lists need not have a fixed size there."""
     is_fixed = pa.types.is_fixed_size_list(kind)
     return (kind, pa.list_(kind.value_type)) if is_fixed else (kind,)

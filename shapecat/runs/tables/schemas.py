@@ -1,8 +1,8 @@
 """The columns of the Parquet tables of a run folder.
 
 A run folder holds ``frames``, ``detections``, ``planes`` and, with colour images, ``masks``
-(written by perceive), and ``tracks`` (written by track). Adding a column is allowed within a schema
-version; changing the meaning of one is not.
+(written by perceive), and ``tracks`` (written by track). Within a schema version, columns may be
+added, but the meaning of a column must not change.
 """
 
 import pyarrow as pa
@@ -40,7 +40,7 @@ _FULL = (
 )
 
 FULL_WIDTHS = {name: kind.list_size for name, kind in _FULL}
-"""Columns of full boxes, and the number of values in each."""
+"""The columns of full boxes, and the number of values in each."""
 FULL_BOX = ("center_full", "size_full", "orientation_full")
 """Columns of the box itself: centre and size in metres, and a quaternion, in the sensor frame."""
 MAY_BE_NULL = (
@@ -49,7 +49,7 @@ MAY_BE_NULL = (
     "center_fixed",
     *FULL_WIDTHS,
 )
-"""Columns of lists of fixed size that may be null."""
+"""Columns with lists of fixed size that may be null."""
 BOX_WIDTH = sum(FULL_WIDTHS[name] for name in FULL_BOX)
 FRAME_COLUMNS = (("topic", pa.string()), ("frame", pa.int32()), ("stamp_ns", pa.int64()))
 """Columns that identify a frame: topic, number on that topic, and stamp."""
@@ -73,10 +73,10 @@ FRAMES = pa.schema(
 )
 """One row per frame read, even without detections. ``up`` is the up direction that detection used;
 ``up_given`` is from transforms, an IMU or an option, null without these. ``revised`` is true if
-the result is from a second look, with the up direction of the whole recording. ``reused_from`` is
-the earlier frame whose scene this one repeats, null if none. ``fixed_*`` is ``fixed_from_sensor``
-(rotation row by row), null if unknown; ``frame_*`` is ``frame_from_sensor``, null if ``frame_id``
-is the frame of the sensor. ``seconds`` has one entry per entry of ``stages``."""
+the phase *revise* replaced the result. ``reused_from`` is the number of the earlier frame whose
+scene this one repeats, null if none. ``fixed_*`` is ``fixed_from_sensor`` (rotation row by row),
+null if unknown; ``frame_*`` is ``frame_from_sensor``, null if ``frame_id`` is the frame of the
+sensor. ``seconds`` has one entry per entry of ``stages``."""
 
 DETECTIONS = pa.schema(
     [
@@ -166,4 +166,4 @@ FIXED_LISTS = {
     for field in schema
     if pa.types.is_fixed_size_list(field.type)
 }
-"""The types of the columns of lists of fixed size."""
+"""The types of all columns with lists of fixed size."""

@@ -1,7 +1,7 @@
-"""Segments: finished parts of the tables, which survive a kill of the run.
+"""Read and write segments: finished parts of the tables, which survive a kill of the run.
 
-Segments are folders that appear when complete and never change. The tables can be joined from
-them again and again, so a kill while they are joined does no harm.
+A segment is a folder that appears when it is complete and never changes. Tables can be joined from
+segments again and again, so a kill while they are joined does no harm.
 """
 
 import shutil
@@ -32,20 +32,20 @@ __all__ = [
 ]
 
 GROUP_FRAMES = 32
-"""Minimum number of frames of a row group."""
+"""Minimum number of frames in a row group."""
 _BALANCE = 4096
-"""Number of frames above which row groups grow with its square root."""
+"""In a table with more frames, row groups grow with the square root of the number of frames."""
 SEGMENTS, REVISIONS = "segments", "revisions"
 
 
 def discard_segments(folder: Path) -> None:
-    """Remove all segments, after they have been joined."""
+    """Remove all segments; call this after they have been joined."""
     for name in (SEGMENTS, REVISIONS):
         shutil.rmtree(folder / name, ignore_errors=True)
 
 
 def read_segments(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Yield frames and planes of the first look, segment by segment.
+    """Yield the frames and planes tables of the phase *perceive*, segment by segment.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def _read_tables(segment: Path) -> _Tables:
 
 
 def _latest(folder: Path) -> Iterator[_Tables]:
-    """Yield the tables of each segment; the results of a second look replace the first ones."""
+    """Yield the tables of each segment of *perceive*, with the frames that *revise* replaced."""
     places = {
         key: segment
         for segment in list_segments(folder / REVISIONS)
@@ -87,13 +87,13 @@ def _latest(folder: Path) -> Iterator[_Tables]:
 
 
 def _revised(frames: pa.Table) -> Iterator[Key]:
-    """Yield the frames in which a second look found a plane or a detection."""
+    """Yield the frames whose result replaces the first: *revise* found a plane or a detection."""
     is_revised = numbers(frames["revised"].cast(pa.int8()))
     return (key for key, revised in zip(frame_rows(frames), is_revised, strict=True) if revised)
 
 
 def _picked(name: str, keys: Sequence[Key], sources: Sequence[_Tables]) -> pa.Table:
-    """Return rows of the table ``name``: those of each key, from the source at its index."""
+    """Return the rows in the table ``name`` of each frame in ``keys``, from its own ``sources``."""
     rows = {id(tables): frame_rows(tables[name]) for tables in sources}
     chosen = [
         (tables[name], rows[id(tables)].get(key, slice(0, 0)))
@@ -112,7 +112,7 @@ def group_frames(frames: int) -> int:
 
 
 def row_groups(folder: Path, length: int) -> Iterator[_Tables]:
-    """Yield the tables of ``length`` frames at a time, whatever the length of the segments."""
+    """Yield the joined tables in row groups of ``length`` frames; the last one may be shorter."""
     pending: _Tables = {}
     for new in _latest(folder):
         pending = (
@@ -139,7 +139,7 @@ def _cut(tables: _Tables, count: int) -> tuple[_Tables, _Tables]:
 
 
 def write_segment(segment: Path, name: str, table: pa.Table) -> None:
-    """Write a segment's part of a table; uncompressed, because it is soon read again."""
+    """Write a segment's part of the table ``name``, uncompressed since it is soon read again."""
     with (
         pa.OSFile(str(_part(segment, name)), "wb") as sink,
         pa.ipc.new_file(sink, table.schema) as writer,
@@ -148,7 +148,7 @@ def write_segment(segment: Path, name: str, table: pa.Table) -> None:
 
 
 def read_segment(segment: Path, name: str) -> pa.Table:
-    """Read the rows of a table that a segment holds.
+    """Read a segment's part of the table ``name``.
 
     Raises
     ------

@@ -50,7 +50,7 @@ def arrow_table(columns: dict[str, Any], schema: pa.Schema) -> pa.Table:
 
 
 def lists(rows: Sequence[Any], kind: pa.DataType) -> pa.Array:
-    """Return rows of numbers, which may differ in length, as a list column of type ``kind``."""
+    """Return rows of numbers as a list column with items of type ``kind``; lengths may differ."""
     flat = [np.ravel(row) for row in rows]
     offsets = np.concatenate([[0], np.cumsum([row.size for row in flat])]).astype(np.int32)
     values = np.concatenate(flat) if flat else np.zeros(0)
