@@ -34,14 +34,14 @@ image, and cameras give up to 60 images per second."""
 _BUFFERED_BYTES = 96 << 20
 """Maximum total size of the kept images, bytes; two images are kept in any case."""
 _STAMP_BYTES = 12
-"""Length of the start of a ROS message, with its stamp. Comparisons of calibrations ignore it."""
+"""Bytes at the start of a ROS message that hold its stamp; ignored in comparing calibrations."""
 _PATIENCE_NS = 500_000_000
 """Maximum log time that a frame waits for a colour image, nanoseconds."""
 _USUAL_PERIOD_NS = 100_000_000
 """Period assumed for a colour stream if it has too few messages to measure one, nanoseconds."""
 KnownImages: TypeAlias = Callable[[str, int], int | None] | None
-"""Returns the log time (ns) of a frame's colour image, given the frame's topic and number; None if
-the frame has no image."""
+"""A function that returns the log time (ns) of a frame's colour image, given the frame's topic and
+number; None if it has no image."""
 
 
 def frames_with_colour(
@@ -61,7 +61,8 @@ def frames_with_colour(
     colours : the colour stream of each depth topic that has one.
     frame_range, skipped : as for `frames`.
     needed : as for `frames`; also called for colour images.
-    same_images : returns which images to use, see `KnownImages`; None for those nearest in time.
+    same_images : returns the log time of the image to use for a frame, see `KnownImages`; None to
+        use the images nearest in time.
 
     Yields
     ------

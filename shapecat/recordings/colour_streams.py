@@ -31,7 +31,7 @@ __all__ = ["ColourStream", "colour_streams", "pair_colours"]
 
 _COLOUR_WORDS = ("color", "colour", "rgb")
 _VIDEO = ("CompressedVideo", "FFMPEGPacket")
-"""Ends of the types of video messages, which are not read."""
+"""Endings of the message types of videos, which cannot be read."""
 _OTHER_WORDS = ("infra", "/ir/", "depth/image", "confidence", "thermal", "mask")
 """Grey images on topics with these words are not from a colour camera."""
 
@@ -79,10 +79,11 @@ def pair_colours(
     A cloud with colours is its own colour stream. Colour images belong to a depth stream if they
     have the same frame or if the topic names begin with the same namespace
     (``/camera/color/image_raw`` and ``/camera/depth/image_raw``), unless they share more components
-    with another depth sensor. Among several, the preference is, in this order: the same frame, the
-    longest common namespace, a topic named after colour, rectified images, more messages,
-    compressed images, the alphabetical order of topics. If a recording has one depth sensor and one
-    stream of colour images, raw or compressed or both, they belong together whatever their names.
+    with another depth sensor. Among several streams, the preference is, in this order: the same
+    frame, the longest common namespace, a topic named after colour, rectified images, more
+    messages, compressed images, the alphabetical order of topics. If a recording has one depth
+    sensor and one stream of colour images, raw or compressed or both, they belong together whatever
+    their names.
 
     Parameters
     ----------

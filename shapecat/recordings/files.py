@@ -11,7 +11,7 @@ _LOG = "-wal"
 
 
 def is_of_bag(name: str) -> bool:
-    """Return whether a file name in the folder of a ROS 2 bag is that of its data or metadata."""
+    """Return whether a file in the folder of a ROS 2 bag belongs to the bag, going by its name."""
     return name == "metadata.yaml" or name.removesuffix(_LOG).endswith(_PARTS)
 
 

@@ -56,7 +56,7 @@ class FrameRange:
             raise ConfigError(msg)
 
     def limits_ns(self, begin_ns: int) -> tuple[int | None, int | None]:
-        """Return the log times (ns) of start and end in a recording that begins at ``begin_ns``."""
+        """Return the log times (ns) of start and end, or None, given that of the first message."""
         start, end = (
             None if seconds is None else begin_ns + round(min(seconds * 1e9, _FAR_NS))
             for seconds in (self.start_s, self.end_s)
@@ -84,7 +84,7 @@ def frames(
     Parameters
     ----------
     skipped : receives the number of unreadable frames by reason; they raise no error.
-    callbacks : by topic, functions to call with its messages, so that the file is read only once.
+    callbacks : for some topics, a function to call with each message of the topic.
     needed : returns whether a frame, or a message for ``callbacks``, is needed, given its topic and
         log time (ns). Others may be left out if the recording has an index; None needs all.
 

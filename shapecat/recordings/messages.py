@@ -28,13 +28,14 @@ Topics: TypeAlias = Collection[str] | None
 TimeLimit: TypeAlias = int | None
 """A log time in nanoseconds; None means no limit."""
 Needed: TypeAlias = Callable[[str, int], bool] | None
-"""Returns whether a message's data is needed, from its topic and log time (ns); None: always."""
+"""A function that returns whether a message's data is needed, given its topic and log time (ns);
+None if all data is needed."""
 
 
 _SMALL = 1 << 16  # bytes
 
 MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
-"""Errors of code that uses a decoded message with missing fields, or with values of wrong types."""
+"""Errors raised when a decoded message is used that lacks fields or has values of wrong types."""
 
 
 class MessageError(RecordingError):

@@ -107,7 +107,7 @@ def _errors(camera: Camera, sample: tuple[F8, F8, F8, F8]) -> tuple[float, float
 
 
 def _sample(points: F4) -> tuple[F8, F8, F8, F8] | None:
-    """Return u, v, x / z and y / z, each (n,), of points spread over the image; None if few."""
+    """Return u, v, x / z and y / z, each (n,), of sampled points; None if there are few."""
     sampled = sample_pixels(points, lambda flat: flat[:, 2] > 0)
     if sampled is None:
         return None
@@ -118,8 +118,8 @@ def _sample(points: F4) -> tuple[F8, F8, F8, F8] | None:
 def sample_pixels(points: F4, valid: Callable[[F4], Bool]) -> tuple[F8, F8, F8] | None:
     """Return u and v (n,), and points (n, 3), of pixels spread over the image; None if too few.
 
-    Of ``points`` (h, w, 3), only finite ones are chosen, and only those in the mask (k,) that
-    ``valid`` returns for points (k, 3).
+    Only finite points of ``points`` (h, w, 3) are chosen. ``valid`` returns, for points (k, 3), a
+    mask (k,) of those that may be chosen.
     """
     height, width = points.shape[:2]
     # A stride that shares no factor with the width visits all columns.

@@ -52,7 +52,7 @@ def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> boo
 
 @lru_cache(maxsize=8)
 def _bend_px(lens: LensCamera, camera: Camera | None) -> float:
-    """Return how far (px) the lens moves the pixels of a pinhole camera: the largest distance."""
+    """Return the largest distance (px) by which the lens moves a pixel of a pinhole camera."""
     if camera is None or not lens.model:
         return 0.0
     pinhole = lens.pinhole

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 __all__ = ["Stream", "by_sensor", "is_of_realsense_recorder", "same_frame"]
 
 _KINDS = ("depth", "points", "cloud", "image", "aligned")
-"""The namespace of a sensor ends before the first component of a topic with one of these words."""
+"""A sensor's namespace ends before the first topic component that contains one of these words."""
 _PLAIN = {
     *("aligned", "color", "colour", "depth", "hw", "image", "raw", "rect", "rectified"),
     *("registered", "rgb", "sw", "cloud", "point", "pointcloud", "points"),
@@ -117,7 +117,7 @@ def _share_namespace(a: _Place, b: _Place) -> bool:
 
 
 def _are_twins(a: Stream, b: Stream, first: _Place, second: _Place) -> bool:
-    """Return whether two instances of a driver, in two namespaces, seem to publish two streams.
+    """Return whether two streams seem to be from two instances of a driver, in two namespaces.
 
     Their topics are then the same after the namespace, but have different calibrations. Clouds have
     no calibration, so the last two components of their topics are compared instead. Two namespaces

@@ -50,12 +50,12 @@ class Source:
         raise NotImplementedError
 
     def finish(self) -> Iterator[Frame]:
-        """Yield the frame that was held back until the end of the recording, if any."""
+        """Yield the frame that is still held back, if any."""
         yield from ()
 
     @contextmanager
     def counting(self) -> Iterator[None]:
-        """In the block, count errors of unreadable messages by reason instead of raising them."""
+        """Within the block, count unreadable messages by reason, and raise no error for them."""
         try:
             yield
         except (MessageError, *MALFORMED) as error:
@@ -120,7 +120,7 @@ class PointsSource(Source):
 
 
 def _placed(points: F4, pose: Pose | None) -> F4:
-    """Transform a cloud (h, w, 3) by its own pose, if any, to the frame that it names."""
+    """Transform a cloud (h, w, 3) by its own pose, if any, to the frame of its ``frame_id``."""
     return points if pose is None else transform(pose, points).astype(np.float32)
 
 

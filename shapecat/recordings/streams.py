@@ -33,7 +33,7 @@ COMPRESSED = "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
 
 _PEEK = 5
-"""Number of messages tried to classify a topic: the first may be damaged or blank."""
+"""Number of messages tried to classify a topic, since the first may be damaged or blank."""
 _WARNINGS = 3
 """Maximum number of warnings about the recording in an error message."""
 _UNREADABLE = "no readable messages"
@@ -49,7 +49,7 @@ _AXES = {"x", "y", "z"}
 def depth_streams(recording: Recording, requested: Sequence[str] = ()) -> tuple[Stream, ...]:
     """Find the clouds and depth images of a recording, sorted by topic.
 
-    The encoding of the first few images, which may be blank, distinguishes depth from colour.
+    The encoding of the first few images (some may be blank) distinguishes depth from colour.
     Topics named after other images, such as confidence or disparity, are left out unless they are
     ``requested``, with or without a leading slash. A depth image is paired with the calibration in
     its own namespace (``depth/image_raw`` with ``depth/camera_info``), or with the only one in the
@@ -208,7 +208,7 @@ def _is_radial(topic: str) -> bool:
 
 
 def _own_name(topic: str) -> str:
-    """Return the last two components of an image topic, or what follows ``depth`` in them."""
+    """Return the last two components of an image topic, or the part of these after ``depth``."""
     return "/".join(_image_name(topic).split("/")[-2:]).rpartition("depth")[2]
 
 
@@ -302,7 +302,7 @@ def info_topic_of(image: str, recording: Recording, frame_id: str) -> str | None
 
 
 def _nearest(image: str, infos: Sequence[str]) -> str | None:
-    """Return the topic in ``infos`` with the longest namespace of an image topic; None if none."""
+    """Return the topic in ``infos`` that shares the longest namespace with ``image``, or None."""
     parts = image.split("/")
     outermost = 2 if image.startswith("/") else 1  # the first part of /depth/image is empty
     for length in range(len(parts), min(len(parts) - 1, outermost) - 1, -1):

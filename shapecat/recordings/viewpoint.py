@@ -93,6 +93,6 @@ def _projection_matrix(places: F8, pixels: F8) -> tuple[F8, float]:
 
 
 def _rq_rotation(linear: F8) -> F8:
-    """Return the rotation in the RQ decomposition of a matrix (3, 3): upper triangle times it."""
+    """Return the rotation Q of the RQ decomposition of a matrix (3, 3), with R upper triangular."""
     rows, triangle = np.linalg.qr(linear[::-1].T)
     return np.asarray(rows.T[::-1] * np.sign(np.diag(triangle)[::-1, None]))

@@ -62,8 +62,8 @@ _BEGUN = (".run.json.partial", ".export.json.partial")
 """Files that a killed command may leave in a folder without a marker."""
 
 Marker = Callable[[Path], Collection[str] | None]
-"""Returns the names of the files and folders that shapecat makes in a folder, the marker last; None
-if the folder has no marker."""
+"""A function that returns the names of the items that shapecat makes in a folder, the marker last;
+None if the folder has no marker."""
 
 
 def made_by_run(folder: Path) -> Collection[str] | None:

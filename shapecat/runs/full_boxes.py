@@ -27,7 +27,7 @@ _NO_ROWS = np.zeros(0, np.int64)
 
 
 class _Selection(NamedTuple):
-    """Columns to read of a table: their names, and a function that joins them as (n, width)."""
+    """Columns to read from a table, and a function that joins them to an array (n, width)."""
 
     columns: list[str]
     width: int
@@ -126,7 +126,7 @@ class FullBoxes:
         return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
 
     def _show(self, fused: FusedBox, sighting: "_Sighting", result: F4) -> None:
-        """Write the fused box of a track to ``result`` (frames, 13), in each sensor frame."""
+        """Write a fused box to the rows ``result`` of its track, in each view's sensor frame."""
         for first in range(0, len(sighting.rows), _BLOCK):
             block = slice(first, first + _BLOCK)
             boxes, poses = sighting.boxes[block], self.frames.poses_of(sighting.rows[block])

@@ -124,7 +124,7 @@ class Summary:
 
     Attributes
     ----------
-    counts : entry of run.json.
+    counts : entry ``counts`` of run.json.
     seconds : total duration of the run.
     processed : False if the run was complete before.
     corrections : outcome of transferring labels from the replaced run; None if there were none.
@@ -232,7 +232,7 @@ def update_place(run: RunInfo, found: InputInfo) -> bool:
 
 
 def require_other_folder(job: Job) -> None:
-    """Check that the results do not go where the recording is.
+    """Check that the results will not replace the recording.
 
     Raises
     ------

@@ -91,7 +91,7 @@ class _MasksByFrame:
 
     @property
     def has_more(self) -> bool:
-        """Whether masks are left: their frames were not requested, or in another order."""
+        """Whether masks are left, since their frames were not requested, or in another order."""
         return self._next is not None
 
 

@@ -120,7 +120,7 @@ class RunInfo(RunIdentity):
 
 
 _hints_of = cache(get_type_hints)
-"""The type of each entry of a class, without `NotRequired`."""
+"""Returns the type of each entry of a class, by name, without `NotRequired`."""
 
 
 def wrong_entry(content: Any, kind: Any = RunInfo, name: str = "") -> str | None:

@@ -14,7 +14,7 @@ from shapecat.recordings.recording import Recording
 __all__ = ["Chunk", "ChunkedRecording", "RawMessage", "in_time_order"]
 
 _PENDING = 512 << 20
-"""Maximum size of the messages held back; with more, no further chunk is read ahead. Bytes."""
+"""Maximum bytes of messages held back; with more, no further chunk is read ahead."""
 
 
 class RawMessage(NamedTuple):

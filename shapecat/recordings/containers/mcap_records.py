@@ -63,7 +63,7 @@ class ChunkError(RecordingError):
 
 
 class Record(NamedTuple):
-    """Opcode of a record, offset and length of its content in bytes; ``whole`` if not truncated."""
+    """Opcode of a record, offset and length of its content (bytes); not ``whole`` if truncated."""
 
     opcode: int
     offset: int

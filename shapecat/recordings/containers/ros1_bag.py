@@ -131,8 +131,8 @@ class BagRecording(ChunkedRecording):
     def _expand(self, record: Record | None, listed: int | None = None) -> Iterator[RawMessage]:
         """Yield the messages of a record; store its connections if the file has no index.
 
-        A truncated chunk is read as far as possible. ``listed`` is the number of messages that the
-        index lists for a chunk: if they are not as many, there is a warning. None skips this check.
+        A truncated chunk is read as far as possible. ``listed`` is its number of messages according
+        to the index; any other number causes a warning. None skips this check.
         """
         if record is None or record.op not in {CHUNK, CONNECTION}:
             return

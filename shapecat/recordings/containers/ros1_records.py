@@ -39,9 +39,9 @@ _LONG = struct.Struct("<Q")
 _TIME = struct.Struct("<II")
 _LONGEST_HEADER = 1 << 20
 _FREELY = 256 << 20
-"""A chunk may have up to this many bytes decompressed, whatever its compressed size."""
+"""A chunk may have a decompressed size of up to this many bytes, whatever its compressed size."""
 _RATIO = 1000
-"""A chunk may also have up to this multiple of its compressed size."""
+"""A chunk may also have a decompressed size of up to this multiple of its compressed size."""
 
 
 class BagError(RecordingError):

@@ -1,1 +1,1 @@
-"""Messages become point clouds, depth images and colour images."""
+"""Decode messages to point clouds, depth images and colour images."""

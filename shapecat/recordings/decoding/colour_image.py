@@ -117,8 +117,8 @@ def pixels_of(image: ColourImage, *, shrink: int = 1) -> U1:
 
     Parameters
     ----------
-    shrink : allow a JPEG image to be decoded at 1/2, 1/4 or 1/8 of its size, but not below
-        1 / ``shrink`` of it, which is several times as fast. Other formats ignore this.
+    shrink : a JPEG image may be decoded at 1/2, 1/4 or 1/8 of its size, but at no less than
+        1 / ``shrink``; that is several times as fast. Other formats ignore this.
 
     Returns
     -------
@@ -134,11 +134,11 @@ def pixels_of(image: ColourImage, *, shrink: int = 1) -> U1:
 
 
 def encoded(image: ColourImage, pixels: U1) -> tuple[str, bytes]:
-    """Return suffix and bytes of a lossless image file: the recorded JPEG or PNG, or a new PNG.
+    """Return suffix and bytes of an image file without loss: the recorded JPEG or PNG, or a PNG.
 
     Parameters
     ----------
-    pixels : (h, w, 3) result of `pixels_of` at full size, which raises if the image is damaged.
+    pixels : (h, w, 3) RGB of the image, from `pixels_of` at full size.
     """
     from PIL import Image  # noqa: PLC0415  # loaded where there is colour
 
@@ -240,7 +240,9 @@ def cloud_colours(message: Any) -> U1:
 def colour_image(
     kind: str, topic: str, stamp_ns: int, log_time_ns: int, decoded: Any
 ) -> ColourImage:
-    """Return the colour image in a decoded message; only colours of a cloud become pixels yet.
+    """Return the colour image in a decoded message.
+
+    An image remains as it is encoded in the message; the colours of a cloud are decoded to RGB.
 
     Parameters
     ----------

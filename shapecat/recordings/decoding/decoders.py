@@ -118,7 +118,7 @@ def _refuse_unrolling(types: dict[str, Any]) -> None:
 
     Raises
     ------
-    ValueError : an array has more than 4096 items.
+    ValueError : such an array has more than 4096 items.
     """
     for name, (_, fields) in types.items():
         for field, description in fields:

@@ -18,7 +18,7 @@ def depth_of_image(message: Any, units: float | None = None) -> F4:
 
     Parameters
     ----------
-    units : units per metre of integer pixels; by default 1000, since they are millimetres.
+    units : units per metre of integer pixels; None for 1000, which means millimetres.
 
     Returns
     -------
@@ -51,7 +51,7 @@ def depth_of_image(message: Any, units: float | None = None) -> F4:
 def clean_depth(values: F4 | U2, units: float = 1) -> F4:
     """Convert depth values (h, w) to metres; negative, infinite and NaN values become 0.
 
-    ``units`` is the number of units per metre of integers; floating-point values are metres.
+    ``units`` is the number of integer units per metre; floating-point values are in metres.
     """
     if values.dtype.kind == "u":
         # Dividing rounds to the nearest float; multiplying by 0.001 does not.

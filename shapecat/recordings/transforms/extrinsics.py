@@ -1,4 +1,4 @@
-"""The pose of the depth sensor in the frame of the colour camera."""
+"""Look up the pose of the depth sensor in the frame of the colour camera."""
 
 from contextlib import suppress
 from functools import cached_property
@@ -28,7 +28,7 @@ _DRIVER = "/extrinsics/depth_to_color"
 
 
 class Extrinsics:
-    """The transform from a depth sensor to a colour camera.
+    """Looks up the transform from a depth sensor to a colour camera.
 
     Sources are, in this order: static transforms, all transforms, and librealsense's own messages
     (``extrinsics/depth_to_color`` of its ROS driver, ``tf/N`` of its recorder).
@@ -96,9 +96,9 @@ class Extrinsics:
         return compose(colour, inverse(depth))
 
     def _driver_topics(self) -> list[str]:
-        """Return the driver's extrinsics topics for the depth topic, the longest namespace first.
+        """Return the driver's extrinsics topics in the namespace of the depth topic, longest first.
 
-        These have its namespace. If there are none, return the recording's only extrinsics topic.
+        If there are none, return the only extrinsics topic of the recording, if there is just one.
         """
         names = {t.name for t in self._recording.topics if f"/{t.name}".endswith(_DRIVER)}
         around = [n for n in names if self._depth.topic.startswith(n.removesuffix(_DRIVER[1:]))]

@@ -1,4 +1,4 @@
-"""The up direction and the sensor pose in each frame of a recording."""
+"""Find the up direction and the sensor pose in each frame of a recording."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -114,7 +114,7 @@ class Upright:
         fixed_frame: str | None,
         streams: Sequence[Stream] = (),
     ) -> "Upright":
-        """Read the first transforms and accelerations of a recording.
+        """Prepare for a recording; read its first transforms and accelerations.
 
         Parameters
         ----------
@@ -173,8 +173,8 @@ class Upright:
     def _choose_fixed_frame(self, first: Frame) -> str | None:
         """Choose one fixed frame for all sensors, preferably one named map, odom or world.
 
-        It is best if the sensor poses are known halfway through the recording, since objects are
-        tracked in the fixed frame only if most frames have a pose. Returns None if there is none.
+        Frames in which sensor poses are known halfway through the recording come first, since
+        objects are tracked there only if most frames have a pose. Returns None if there is none.
         """
         halfway_ns = first.stamp_ns + max(0, self.middle_ns - first.log_time_ns)
         candidates = [
@@ -185,7 +185,7 @@ class Upright:
         return min((name for name in candidates if name is not None), key=_rank, default=own_frame)
 
     def corrected(self, topic: str, orientation: Orientation) -> Orientation:
-        """Convert an orientation from the frame that a topic's data name to their true frame."""
+        """Return the orientation of a topic's data, corrected if `assume_misnamed` was called."""
         source, up, pose = orientation
         turn = self.misnamed.get(topic)
         if turn is None:
@@ -285,7 +285,7 @@ def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:
 
 
 def turned(up: F4, named_from_data: F8) -> F4:
-    """Convert a direction (3,) from the frame that data name to the true frame of the data."""
+    """Convert a direction (3,) from the frame named in ``frame_id`` to that of the data."""
     return np.asarray(up @ named_from_data, np.float32)
 
 

@@ -48,7 +48,7 @@ class TransformTrack:
         return TransformSample(self._parents[k], (x, y, z), tuple(quaternion))
 
     def gaps_ns(self, stamp: int) -> tuple[int, int]:
-        """Return the time (ns) from the last sample to a stamp, and from there to the first one.
+        """Return the time from the last sample to a stamp, and from the stamp to the first, ns.
 
         A positive time means that the stamp is outside the samples; latched samples never end.
         """

@@ -1,4 +1,4 @@
-"""The transforms of a recording around its frames, in constant memory."""
+"""Keep the transforms around the current frame of a recording, in constant memory."""
 
 from collections.abc import Sequence
 from copy import deepcopy
@@ -35,7 +35,7 @@ class TransformWindow:
         tree: TransformBuffer | None = None,
         ahead: LookAhead | None = None,
     ) -> None:
-        """Use ``buffer``, which ``ahead`` fills as needed; None if it holds all transforms."""
+        """Use ``buffer``, which holds all transforms, or is filled by ``ahead`` as needed."""
         self.tree = buffer if tree is None else tree
         self._known, self._ahead = buffer, ahead
 

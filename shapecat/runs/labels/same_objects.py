@@ -34,7 +34,7 @@ _REACH = 0.5
 _LEAST_REACH_M = 0.04
 """Lower limit of that distance, for small objects."""
 _CLEAR_M = 0.03
-"""A match is ambiguous unless the next object is farther away by at least this."""
+"""A match is ambiguous unless the second nearest object is farther away by at least this."""
 _SIZE_RATIO = 1.8
 """Largest ratio between the largest extents of an object in two recordings."""
 
@@ -121,7 +121,8 @@ def _widths(folder: Path, tracks: TrackDetections) -> F8:
 def _max_distance_at_once(a: F8, b: F8) -> F8:
     """Return the largest distance (n, m) at which detections with these widths may be one object.
 
-    It is half of their mean width, since two objects side by side are farther apart.
+    It is half of their mean width, since two objects side by side are farther apart, but at least
+    4 cm and at most 10 cm.
     """
     mean_width = (a[:, None] + b[None]) / 2
     return np.clip(_REACH * mean_width, _LEAST_REACH_M, _MOST_REACH_M)

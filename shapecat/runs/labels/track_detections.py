@@ -29,7 +29,7 @@ class TrackDetections(NamedTuple):
     tracks, numbers, detections : (n,) track, frame and detection numbers.
     frames : the `_Moment` of each detection.
     centers : (n, 3) metres, fixed frame.
-    keys : rows of the arrays by `_Moment`.
+    keys : the rows of each `_Moment`.
     """
 
     tracks: I4

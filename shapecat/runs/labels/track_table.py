@@ -54,7 +54,7 @@ class TrackRow:
 
 @dataclass(frozen=True)
 class TrackTable:
-    """The rows of a tracks.csv, and the problems in its lines: invalid or perhaps misread ones."""
+    """The rows of a tracks.csv, and the problems of its invalid or perhaps misread lines."""
 
     columns: tuple[str, ...]
     rows: tuple[TrackRow, ...]
@@ -125,7 +125,7 @@ def _text(path: Path) -> tuple[str, bool]:
 
     Raises
     ------
-    OutputError : the file is unreadable, too large or not a text.
+    OutputError : the file is unreadable, too large or not text.
     """
     with explained(f"{path}: cannot be read", OutputError):
         if path.stat().st_size > _LARGEST_TABLE:

@@ -138,7 +138,7 @@ def _with_new_categories(transfer: Transfer, tracks: Container[int]) -> Transfer
 
 
 def _without(transfer: Transfer, reasons: Mapping[int, str]) -> Transfer:
-    """Return a transfer without the labels of some tracks, which are missed for these reasons."""
+    """Return a transfer in which the labels of some tracks are missed, for these reasons."""
     remaining = tuple(item for item in transfer.transferred if item.track not in reasons)
     missed = (
         Missed(item.old_track, item.label, reasons[item.track])

@@ -17,7 +17,7 @@ def explain_clocks(folder: Path) -> Iterator[str]:
     """Yield a warning if the sensors of a run have different clocks.
 
     The log times of all images are from one clock, that of the recorder. If the clocks of the
-    sensors agree, too, all have about the same delay from stamp to log time. A difference matters
+    sensors agree, all images have about the same delay from stamp to log time. A difference matters
     only to sensors that are tracked together.
 
     Parameters

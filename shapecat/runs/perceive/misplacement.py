@@ -42,7 +42,7 @@ class _Centers(NamedTuple):
 
 
 def explain_misplacement(folder: Path, fixed_frame: str) -> Iterator[str]:
-    """Yield a warning for each topic whose objects move farther in the fixed than the sensor frame.
+    """Yield a warning for each topic with sensor poses that are worse than none.
 
     Parameters
     ----------

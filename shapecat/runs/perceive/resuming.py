@@ -33,7 +33,7 @@ def require_resumable(job: Job, planned: RunInfo, digest: Callable[[], str]) -> 
 
     Raises
     ------
-    OutputError : the folder has finished work of another input, model or settings.
+    OutputError : the folder has frames of another input, model or settings.
     """
     folder = partial_path(job.folder)
     if job.overwrite or not has_work(folder):

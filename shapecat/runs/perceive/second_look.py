@@ -81,7 +81,7 @@ class _Stream(NamedTuple):
 
 
 def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, Revision]:
-    """Choose the frames without a plane, or with planes that disagree with the recording.
+    """Choose the frames without a plane, or with planes that disagree with other frames.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
 
     Returns
     -------
-    For each frame for which a better up direction is now known, how to revise it.
+    The better up direction for each of these frames, if one is known.
 
     Notes
     -----
@@ -136,7 +136,7 @@ def _around(stream: _Stream, k: int) -> I4:
 
 
 def _other_support(stream: _Stream, off: Bool) -> Bool:
-    """Return which frames (n,) have no plane at the height of the lowest one of nearby frames.
+    """Return whether frames (n,) lack a plane at the height of the lowest ones of nearby frames.
 
     ``off`` (n,) marks the frames that are not compared.
     """

@@ -1,4 +1,4 @@
-"""Read the table of masks, the pixels of detections on colour images; make its columns."""
+"""Make and read the table of masks: the pixels of each detection on a colour image."""
 
 from collections.abc import Iterable, Iterator
 from itertools import chain, pairwise

@@ -41,7 +41,7 @@ __all__ = [
 _NUMBERS = {"center", "size", "orientation", "posterior", *FULL_BOX}
 """Columns whose numbers are finite."""
 _TUPLES = {"edges": 2, "neurons": 3, "outline": 3}
-"""Columns with flat lists, and the number of values of each item in these."""
+"""Columns with flat lists of items, and the number of values per item."""
 
 Key = tuple[str, int]
 """A frame: its topic, and its number on that topic."""
@@ -140,7 +140,7 @@ def read_together(
 ) -> Iterator[tuple[pa.Table, ...]]:
     """Yield the row groups of the same frames from several tables of a run folder.
 
-    ``columns`` holds the columns to read by name of the table; None reads all of them.
+    ``columns`` maps the names of the tables to the columns to read; None for all columns.
 
     Raises
     ------
