@@ -34,7 +34,8 @@ image, and cameras give up to 60 images per second."""
 _BUFFERED_BYTES = 96 << 20
 """Maximum total size of the kept images, bytes; two images are kept in any case."""
 _STAMP_BYTES = 12
-"""Bytes at the start of a ROS message that hold its stamp; ignored in comparing calibrations."""
+"""Length of the start of a ROS message, which holds its stamp, bytes. Calibrations are compared
+without it."""
 _PATIENCE_NS = 500_000_000
 """Maximum log time that a frame waits for a colour image, nanoseconds."""
 _USUAL_PERIOD_NS = 100_000_000
@@ -284,7 +285,10 @@ class _Partner:
 
     @cached_property
     def _first_lens(self) -> LensCamera | None:
-        """The lens of the recording's first calibration, for images before it; None without one."""
+        """The lens of the first calibration in the recording; None if there is none.
+
+        It serves images that precede all calibrations.
+        """
         topic = self.stream.info_topic
         info = None if topic is None else first_message(self._recording, topic)
         with suppress(RecordingError, *MALFORMED):

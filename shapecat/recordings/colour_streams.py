@@ -78,12 +78,13 @@ def pair_colours(
 
     A cloud with colours is its own colour stream. Colour images belong to a depth stream if they
     have the same frame or if the topic names begin with the same namespace
-    (``/camera/color/image_raw`` and ``/camera/depth/image_raw``), unless they share more components
-    with another depth sensor. Among several streams, the preference is, in this order: the same
-    frame, the longest common namespace, a topic named after colour, rectified images, more
-    messages, compressed images, the alphabetical order of topics. If a recording has one depth
-    sensor and one stream of colour images, raw or compressed or both, they belong together whatever
-    their names.
+    (``/camera/color/image_raw`` and ``/camera/depth/image_raw``), unless their topic shares more of
+    its namespace with another depth sensor. If a recording has one depth sensor and one stream of
+    colour images, raw or compressed or both, they belong together whatever their names.
+
+    Among several streams, the preference is, in this order: the same frame, the longest common
+    namespace, a topic named after colour, rectified images, more messages, compressed images, the
+    alphabetical order of topics.
 
     Parameters
     ----------

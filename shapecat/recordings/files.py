@@ -11,7 +11,7 @@ _LOG = "-wal"
 
 
 def is_of_bag(name: str) -> bool:
-    """Return whether a file in the folder of a ROS 2 bag belongs to the bag, going by its name."""
+    """Return whether a file with this name, in the folder of a ROS 2 bag, is part of the bag."""
     return name == "metadata.yaml" or name.removesuffix(_LOG).endswith(_PARTS)
 
 

@@ -56,7 +56,10 @@ class FrameRange:
             raise ConfigError(msg)
 
     def limits_ns(self, begin_ns: int) -> tuple[int | None, int | None]:
-        """Return the log times (ns) of start and end, or None, given that of the first message."""
+        """Return the log times (ns) of start and end in a recording that begins at ``begin_ns``.
+
+        They are None where there is no limit.
+        """
         start, end = (
             None if seconds is None else begin_ns + round(min(seconds * 1e9, _FAR_NS))
             for seconds in (self.start_s, self.end_s)

@@ -55,7 +55,7 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
 
     Parameters
     ----------
-    points : (h, w, 3) metres, not finite where depth is missing.
+    points : (h, w, 3) metres; NaN or infinite where depth is missing.
 
     Returns
     -------
@@ -136,7 +136,7 @@ def sample_pixels(points: F4, valid: Callable[[F4], Bool]) -> tuple[F8, F8, F8] 
 
 
 def _medians(a: F8, b: F8) -> tuple[F8, F8]:
-    """Return the medians of ``a`` and ``b`` in 16 bins of ``b``, which outliers hardly move."""
+    """Return the medians of ``a`` and ``b`` in 16 bins of ``b``. Outliers hardly move medians."""
     groups = np.array_split(np.argsort(b, kind="stable"), 16)
     return (
         np.array([np.median(a[group]) for group in groups]),

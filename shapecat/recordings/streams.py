@@ -70,7 +70,7 @@ def depth_streams(recording: Recording, requested: Sequence[str] = ()) -> tuple[
 
 
 def choose_streams(recording: Recording, requested: Sequence[str] = ()) -> tuple[Stream, ...]:
-    """Choose the streams to process: the requested ones, or the best one of the only sensor.
+    """Choose the streams to process: those requested, else the best one if there is one sensor.
 
     `by_sensor` says which streams belong to the same sensor. Within a sensor the preference is, in
     this order: no doubt about content or calibration; depth images, since a cloud holds the same
@@ -213,7 +213,7 @@ def _own_name(topic: str) -> str:
 
 
 def first_message(recording: Recording, topic: str) -> Any:
-    """Return the first of `first_messages`; None if there is none."""
+    """Return the first decodable message among a topic's first few; None if there is none."""
     return next(first_messages(recording, topic), None)
 
 

@@ -25,8 +25,8 @@ def find_viewpoint(points: F4, previous: PinholeFit | None) -> tuple[PinholeFit,
 
     Parameters
     ----------
-    points : (h, w, 3) metres, not finite or zero where depth is missing.
-    previous : the camera of an earlier cloud, which is kept if it fits.
+    points : (h, w, 3) metres; NaN, infinite or zero where depth is missing.
+    previous : the camera of an earlier cloud, which is kept if it fits; None if there is none.
 
     Returns
     -------

@@ -130,7 +130,7 @@ def staged(
 
 
 def require_ours(folder: Path, marker: Marker = made_by_run) -> None:
-    """Check that a folder is missing, empty or made by shapecat, which ``marker`` recognises.
+    """Check that a folder is missing, empty, or made by shapecat according to ``marker``.
 
     Raises
     ------

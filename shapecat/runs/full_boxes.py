@@ -119,14 +119,17 @@ class FullBoxes:
         return result
 
     def _views(self, sighting: "_Sighting", picked: I4, details: F4) -> BoxViews:
-        """Return the views ``picked`` of a track in the fixed frame; ``details`` are `_DETAILS`."""
+        """Return the views ``picked`` of a track in the fixed frame, given their `_DETAILS`."""
         boxes, poses = sighting.boxes[picked], self.frames.poses_of(sighting.rows[picked])
         centers, axes = _placed(boxes, poses)
         sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)
         return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
 
     def _show(self, fused: FusedBox, sighting: "_Sighting", result: F4) -> None:
-        """Write a fused box to the rows ``result`` of its track, in each view's sensor frame."""
+        """Write the fused box of a track, in the sensor frame of each of its views.
+
+        ``result`` (frames, 13) are the rows of the track.
+        """
         for first in range(0, len(sighting.rows), _BLOCK):
             block = slice(first, first + _BLOCK)
             boxes, poses = sighting.boxes[block], self.frames.poses_of(sighting.rows[block])

@@ -186,7 +186,7 @@ def differences(run: RunInfo, planned: Mapping[str, Any]) -> dict[str, str]:
 
 
 def describe_differences(differing: Mapping[str, str]) -> str:
-    """Return the `differences` of a run, and any in the input, as words for an error message."""
+    """Describe the `differences` of a run, and perhaps of its input, for an error message."""
     listed = "; ".join(f"{name}: {text}" for name, text in differing.items())
     return f"another input, model or settings ({listed})"
 
@@ -224,7 +224,10 @@ def identify(run: RunInfo, content: ContentDigest) -> None:
 
 
 def update_place(run: RunInfo, found: InputInfo) -> bool:
-    """Store in a run where its recording was ``found``, if it was moved; return whether it was."""
+    """Correct the path of a run's recording if it was moved; return whether it was.
+
+    ``found`` describes the recording at its new path.
+    """
     moved = not Path(run["input"]["path"]).exists() and run["input"]["path"] != found["path"]
     if moved:
         run["input"] |= {"path": found["path"], "files": found["files"]}

@@ -91,7 +91,10 @@ class _MasksByFrame:
 
     @property
     def has_more(self) -> bool:
-        """Whether masks are left, since their frames were not requested, or in another order."""
+        """Whether masks are left.
+
+        Their frames were then not requested, or in another order.
+        """
         return self._next is not None
 
 
@@ -106,7 +109,10 @@ def rows_by_frame(table: pa.Table) -> dict[tuple[str, int], list[dict[str, Any]]
 
 
 def _values(column: pa.ChunkedArray) -> Sequence[Any]:
-    """Return the value of each row: an array in list columns without nulls, else a Python value."""
+    """Return the values of a column, one per row.
+
+    Values of list columns without nulls are arrays, others are Python values.
+    """
     fixed = pa.types.is_fixed_size_list(column.type)
     if column.null_count or not (fixed or pa.types.is_list(column.type)):
         return list(column.to_pylist())

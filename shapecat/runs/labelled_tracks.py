@@ -92,7 +92,7 @@ class LabelledTracks:
             )
 
     def objects(self, key: Key) -> dict[TrackLabel, dict[int, int]]:
-        """Return the objects of a frame by label: array rows of their detections, by number.
+        """Return the objects of a frame: by label, the number and array row of each detection.
 
         An object has several detections if a person merged tracks that are both in the frame.
         Objects are in the order of their first detections.
@@ -186,7 +186,7 @@ def _boxes(
 
 
 def _join(places: F8, up: F4) -> F8:
-    """Return the upright box (10,) around the boxes (n, 10) of an object; a single box as it is."""
+    """Return the only box of an object, or the upright box (10,) around its boxes (n, 10)."""
     place: F8 = places[0]
     if len(places) > 1:
         box = box_around((Box(row[:3], row[3:6], row[6:]) for row in places), up)

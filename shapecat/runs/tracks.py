@@ -208,10 +208,13 @@ def _turned(orientations: F4, turns: F8) -> F8:
 def _columns(
     tracks: Sequence[Track], frames: DetectedFrames, boxes: F4, categories: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the table columns of some tracks and their full boxes (n, 13), track after track."""
+    """Return the table columns of some tracks, track after track.
+
+    ``boxes`` (n, 13) are their full boxes.
+    """
 
     def column(name: str, kind: str, *width: int) -> Any:
-        """Concatenate an attribute of the tracks, of which there may be none."""
+        """Concatenate an attribute of the tracks; the result is empty if there are no tracks."""
         values = [np.asarray(getattr(track, name), kind) for track in tracks]
         return np.concatenate([np.zeros((0, *width), kind), *values])
 

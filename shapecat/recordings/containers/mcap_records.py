@@ -63,7 +63,10 @@ class ChunkError(RecordingError):
 
 
 class Record(NamedTuple):
-    """Opcode of a record, offset and length of its content (bytes); not ``whole`` if truncated."""
+    """Opcode of a record; offset and length of its content, bytes.
+
+    ``whole`` is False if the record is truncated.
+    """
 
     opcode: int
     offset: int

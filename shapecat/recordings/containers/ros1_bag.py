@@ -101,7 +101,10 @@ class BagRecording(ChunkedRecording):
         return None
 
     def _chunk_info(self, record: Record) -> Chunk:
-        """Return the described chunk; its ``entry`` is the number of messages by connection id."""
+        """Return the chunk that a chunk info record describes.
+
+        Its ``entry`` holds the number of messages by connection id.
+        """
         counts = dict(struct.iter_unpack("<II", self._data(record)))
         start, end = (time_of(record.fields, name) for name in ("start_time", "end_time"))
         return Chunk(start, end, u8(record.fields, "chunk_pos"), counts.keys(), counts)

@@ -151,7 +151,10 @@ class DatabaseRecording(Recording):
     def _single_rows(
         self, numbers: list[int], times: list[int | None], done: int
     ) -> Iterator[tuple[int, int, Any]]:
-        """Yield rows as `_rows` does, after the first ``done``; read the data of one at a time."""
+        """Yield rows as `_rows` does, but read the data of each with a query of its own.
+
+        The first ``done`` rows are left out.
+        """
         start, stop = times
         given = ",".join("?" * len(numbers))
         rows = (

@@ -134,7 +134,7 @@ def pixels_of(image: ColourImage, *, shrink: int = 1) -> U1:
 
 
 def encoded(image: ColourImage, pixels: U1) -> tuple[str, bytes]:
-    """Return suffix and bytes of an image file without loss: the recorded JPEG or PNG, or a PNG.
+    """Return the suffix and bytes of an image file: the recorded JPEG or PNG, else a new PNG.
 
     Parameters
     ----------

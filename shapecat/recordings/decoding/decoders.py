@@ -48,7 +48,7 @@ _SEPARATOR = "=" * 80 + "\n"
 
 
 def decode(message: Message, decoders: dict[tuple[str, str, bytes], Decoder]) -> Any:
-    """Decode a message; store a decoder for its type in the cache ``decoders``.
+    """Decode a message to an object with its fields as attributes; cache decoders in ``decoders``.
 
     Raises
     ------

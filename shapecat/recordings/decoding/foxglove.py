@@ -32,7 +32,7 @@ def ros_counterpart(kind: str) -> str:
 
 
 def _plain(kind: str) -> str:
-    """Return the JSON and protobuf name of a Foxglove type, given that or its ROS name."""
+    """Return a Foxglove type's name in JSON and protobuf; ``kind`` may also be its ROS name."""
     return kind.replace("foxglove_msgs/msg/", "foxglove.")
 
 

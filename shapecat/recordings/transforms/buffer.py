@@ -168,7 +168,10 @@ class TransformBuffer:
         return name
 
     def _ancestors(self, frame_id: str, stamp_ns: int | None = None) -> list[str]:
-        """Return a frame and its ancestors at a time; by the latest transforms if it is None."""
+        """Return a frame and its ancestors at a stamp (ns).
+
+        If the stamp is None, the latest transforms determine them.
+        """
         chain = [frame_id]
         while (parent := self._parent(chain[-1], stamp_ns)) is not None:
             if parent in chain or len(chain) > _DEEPEST:

@@ -50,7 +50,7 @@ class Extrinsics:
     def colour_from_depth(
         self, depth_frame: str, colour_frame: str, log_time_ns: int, stamp_ns: int
     ) -> Pose | None:
-        """Return ``colour_from_depth`` at a time, or None if the recording does not hold it.
+        """Return the pose ``colour_from_depth`` at the time of a depth image; None if unknown.
 
         Parameters
         ----------
@@ -84,7 +84,10 @@ class Extrinsics:
 
     @cached_property
     def _realsense(self) -> Pose | None:
-        """Read librealsense's ``p_colour = rotation @ p_depth + translation``; None if absent."""
+        """The pose ``colour_from_depth`` in librealsense's own messages; None if there is none.
+
+        The messages hold rotation and translation: ``p_colour = rotation @ p_depth + translation``.
+        """
         for topic in self._driver_topics():
             with suppress(RecordingError, *MALFORMED):
                 pose = _driver_pose(first_message(self._recording, topic))

@@ -114,7 +114,7 @@ class Upright:
         fixed_frame: str | None,
         streams: Sequence[Stream] = (),
     ) -> "Upright":
-        """Prepare for a recording; read its first transforms and accelerations.
+        """Prepare to look up frames of a recording; read its first transforms and accelerations.
 
         Parameters
         ----------
@@ -200,7 +200,10 @@ class Upright:
         self.warnings.append(f"{topic}: {misnaming.text}; its transforms are corrected")
 
     def accept(self, topic: str, orientation: Orientation) -> F4 | None:
-        """Return the up direction, or None if it is unknown or dropped; count it by its source."""
+        """Return the up direction of a frame, and count it by its source.
+
+        It is None if the direction is unknown, or dropped for this topic.
+        """
         up = None if topic in self.dropped else orientation.up
         source = "planes" if up is None else orientation.source
         self.given[source] = self.given.get(source, 0) + 1
@@ -295,7 +298,10 @@ def has_z_up(frame_id: str) -> bool:
 
 
 def _rank(name: str) -> int:
-    """Return the index of a frame, without its robot, in `_LEVEL_FRAMES`; others come last."""
+    """Return the index in `_LEVEL_FRAMES` of a frame, without the robot's name.
+
+    Frames that are not listed come last.
+    """
     plain = name.rpartition("/")[2]
     return _LEVEL_FRAMES.index(plain) if plain in _LEVEL_FRAMES else len(_LEVEL_FRAMES)
 

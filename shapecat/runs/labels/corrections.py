@@ -137,17 +137,22 @@ def _contradictions(table: TrackTable, original: TrackTable) -> list[str]:
 def adopt_labels(corrected: Path, folder: Path) -> None:
     """Apply the labels of a corrected table to a run.
 
-    Only the column ``label`` is applied. ``corrected`` may be the run's own tracks.csv, which must
-    list all tracks. Tracks that another table does not list keep their labels. A report page adds a
-    column ``label_seen`` with the labels that it read: tracks for which the two columns are equal
-    keep their labels, too, since other corrections may be newer. If labels are replaced, the
-    previous table is kept as tracks.previous.csv.
+    Only the column ``label`` is applied. A table from a report page also has a column
+    ``label_seen`` with the labels that the page read; a label that was not changed there is not
+    applied, since other corrections may be newer. If labels are replaced, the previous table is
+    kept as tracks.previous.csv.
+
+    Parameters
+    ----------
+    corrected : the run's own tracks.csv, which must list all tracks; or another table, in which
+        missing tracks keep their labels.
+    folder : the run folder.
 
     Raises
     ------
-    OutputError : the table is unreadable, belongs to another run, names tracks that the run does
-        not have or other categories in the column ``category``, or has invalid labels. The error
-        message lists all these lines, and nothing is written.
+    OutputError : the table is unreadable, belongs to another run, or has invalid lines, with
+        unknown tracks, other categories or invalid labels. The error message lists these lines,
+        and nothing is written.
     """
     with holding(folder):
         _adopt(corrected, folder)

@@ -92,6 +92,10 @@ def transfer_labels(source: Path, target: Path) -> Transfer:
     source : a run folder, or a tracks.csv.
     target : a run folder with tracks.
 
+    Returns
+    -------
+    The transferred labels, and those that could not be transferred.
+
     Raises
     ------
     OutputError : one of them is unreadable; or objects must be matched by place, but the two have
@@ -138,7 +142,7 @@ def _with_new_categories(transfer: Transfer, tracks: Container[int]) -> Transfer
 
 
 def _without(transfer: Transfer, reasons: Mapping[int, str]) -> Transfer:
-    """Return a transfer in which the labels of some tracks are missed, for these reasons."""
+    """Return a transfer in which the labels of some tracks count as missed, for these reasons."""
     remaining = tuple(item for item in transfer.transferred if item.track not in reasons)
     missed = (
         Missed(item.old_track, item.label, reasons[item.track])
@@ -149,7 +153,9 @@ def _without(transfer: Transfer, reasons: Mapping[int, str]) -> Transfer:
 
 
 def match_labels(source: Path, target: Path) -> Transfer:
-    """Find the tracks of a run that are the same objects as the labelled tracks of a table.
+    """Match the labelled tracks of a table with tracks of a run that are the same objects.
+
+    The result is as for `transfer_labels`, but nothing is written.
 
     Raises
     ------
@@ -258,6 +264,6 @@ def _translate(
 
 
 def _why(track: int, whole: int, matches: Matches) -> str:
-    """Return the reason why the whole that a track belongs to has no match."""
+    """Return the reason why a track has no match: its *whole* (see `_translate`) has none."""
     reason = matches.reasons.get(whole, "nothing was found there")
     return reason if track == whole else f"track #{whole}, which it is merged with: {reason}"

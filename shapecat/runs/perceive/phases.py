@@ -176,7 +176,10 @@ def _perceiving(
 def _blocks(
     views: Iterator[_Item], size: int
 ) -> Iterator[tuple[tuple[FrameRow, ...], tuple[PerceptionInput, ...]]]:
-    """Yield blocks of ``size`` frames until asked to stop; these are the same in every run."""
+    """Yield blocks of ``size`` frames, until asked to stop.
+
+    The blocks are the same in every run.
+    """
     while not stopping.asked() and (block := tuple(islice(views, size))):
         rows, perceptions = zip(*block, strict=True)
         yield rows, perceptions

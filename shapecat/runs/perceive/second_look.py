@@ -120,7 +120,10 @@ def _fixed_up(stream: _Stream, posed: Bool) -> F8:
 
 
 def _still_up(stream: _Stream) -> F8:
-    """Return, for each frame, the up direction of nearby frames (n, 3); NaN if the camera moved."""
+    """Return, for each frame, the up direction (n, 3) on which the nearby frames agree.
+
+    It is NaN if they do not agree, since the camera moved.
+    """
     level, expected = stream.level, np.full(stream.up.shape, np.nan)
     for k in range(len(expected)):
         neighbours = _around(stream, k)
@@ -153,7 +156,10 @@ def _other_support(stream: _Stream, off: Bool) -> Bool:
 
 
 def _agreed(up: F8, within_deg: float, share: float) -> F8:
-    """Return the direction (3,) on which more than ``share`` of the ``up`` (n, 3) agree, or NaN."""
+    """Return the direction (3,) on which more than ``share`` of the directions agree.
+
+    ``up`` (n, 3) are the directions. The result is NaN if too few agree.
+    """
     if len(up) < _FEWEST:
         return np.full(3, np.nan)
     inliers = _cosine(up, np.median(up, axis=0)) > _cos(within_deg)

@@ -70,7 +70,10 @@ class UpCheck:
         yield from pending
 
     def _look(self, frame: Frame, orientation: Orientation) -> None:
-        """Compare the up direction of a frame with its planes; decide if enough were compared."""
+        """Compare the up direction of a frame with its planes.
+
+        After enough frames, decide whether the topic has the right up direction.
+        """
         self._looks[frame.topic] += 1
         hint, off = orientation.up, self._off_deg.get(frame.topic, [])
         elsewhere = frame.points is not None and has_z_up(frame.frame_id)

@@ -67,7 +67,7 @@ def _angles_to_planes(folder: Path) -> tuple[list[float], int]:
     Returns
     -------
     The angle between the two in each frame with a plane, degrees; and the number of frames that
-    have a given up direction, but neither a plane nor an object, which implies a plane.
+    have a given up direction, but neither planes nor objects.
     """
     angles, bare = [], 0
     rows = ["topic", "frame"]

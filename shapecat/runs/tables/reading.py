@@ -249,7 +249,7 @@ def opened(
 
 
 def _validated(table: pa.Table) -> pa.Table:
-    """Return rows of a table, with lists of fixed size.
+    """Check the values in some rows of a table; return them with lists of fixed size.
 
     Raises
     ------

@@ -69,7 +69,10 @@ def _read_tables(segment: Path) -> _Tables:
 
 
 def _latest(folder: Path) -> Iterator[_Tables]:
-    """Yield the tables of each segment of *perceive*; frames of *revise* replace its results."""
+    """Yield the tables of each segment of *perceive*.
+
+    Results of *revise* replace those of *perceive*.
+    """
     places = {
         key: segment
         for segment in list_segments(folder / REVISIONS)
@@ -87,13 +90,19 @@ def _latest(folder: Path) -> Iterator[_Tables]:
 
 
 def _revised(frames: pa.Table) -> Iterator[Key]:
-    """Yield the frames in which *revise* found something, so that they replace the first result."""
+    """Yield the frames in which *revise* found a plane or an object.
+
+    Their results replace those of *perceive*.
+    """
     is_revised = numbers(frames["revised"].cast(pa.int8()))
     return (key for key, revised in zip(frame_rows(frames), is_revised, strict=True) if revised)
 
 
 def _picked(name: str, keys: Sequence[Key], sources: Sequence[_Tables]) -> pa.Table:
-    """Return the rows of frames in the table ``name``; those of ``keys[k]`` from ``sources[k]``."""
+    """Return the rows of some frames in the table ``name``.
+
+    The rows of the frame ``keys[k]`` are taken from ``sources[k]``.
+    """
     rows = {id(tables): frame_rows(tables[name]) for tables in sources}
     chosen = [
         (tables[name], rows[id(tables)].get(key, slice(0, 0)))
