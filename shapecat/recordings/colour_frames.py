@@ -197,7 +197,7 @@ class _Partner:
     def reaches(self, frame: Frame) -> bool:
         """Return whether the image of a frame, if it has one, has been read.
 
-        It has once an image with the same or a later stamp was read, since no later one is nearer.
+        Once an image with the same or a later stamp has been read, no later image can be nearer.
         """
         if self._same_images is not None:
             return self._same_images(frame.topic, frame.index) is None or bool(

@@ -93,8 +93,8 @@ def pair_colours(
 
     Returns
     -------
-    The colour stream of each depth topic that has one. Its ``info_topic`` is None if it would be
-    that of the depth stream.
+    The colour stream of each depth topic that has one. If its ``info_topic`` is that of the depth
+    stream, it is replaced by None.
 
     Raises
     ------
@@ -165,8 +165,8 @@ def _nearest_sensors(
 ) -> dict[str, list[_NearSensor]]:
     """Return the two sensors nearest to a colour topic, for each kind of depth stream.
 
-    These share the most namespace components with it. Two are enough to compare any sensor with the
-    nearest other one.
+    The nearest sensors share the most namespace components with it. Two are enough to compare any
+    sensor with the nearest other one.
     """
     nearest: dict[str, list[_NearSensor]] = {}
     for kind in ("depth", "points"):

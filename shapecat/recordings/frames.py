@@ -89,11 +89,11 @@ def frames(
     skipped : receives the number of unreadable frames by reason; they raise no error.
     callbacks : for some topics, a function to call with each message of the topic.
     needed : returns whether a frame, or a message for ``callbacks``, is needed, given its topic and
-        log time (ns). Others may be left out if the recording has an index; None needs all.
+        log time (ns). Others may be left out if the recording has an index. None if all are needed.
 
     Yields
     ------
-    Frames by log time. ``index`` counts the messages of its stream, from 0 at ``start_s``.
+    Frames by log time. Their ``index`` counts the messages of their stream, from 0 at ``start_s``.
     """
     sources: dict[str, Source] = {
         stream.topic: SOURCES[stream.kind](recording, stream, skipped) for stream in streams

@@ -17,7 +17,7 @@ its stamp, and publish transforms more often than this."""
 
 
 def is_read_at_once(recording: Recording) -> bool:
-    """Return whether all messages are read at the start: the recording is short or has no index."""
+    """Return whether a recording is read at once, since it is short or has no index."""
     return recording.end_ns - recording.start_ns <= 2 * AROUND_NS or not recording.indexed
 
 
@@ -26,8 +26,8 @@ class LookAhead:
 
     Attributes
     ----------
-    whole : whether all messages are passed on, regardless of the frames: if `is_read_at_once`, or
-        after `read_all`.
+    whole : whether all messages are passed on, regardless of the frames. This is so if
+        `is_read_at_once`, or after `read_all`.
     """
 
     def __init__(

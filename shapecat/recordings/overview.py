@@ -50,7 +50,7 @@ def describe_recording(path: Path) -> dict[str, Any]:
 
 
 def _uses(recording: Recording, streams: Mapping[str, Stream]) -> dict[str, str]:
-    """Return the purpose of each topic that shapecat uses, in words, by topic."""
+    """Return the purpose of each topic that shapecat uses, in words."""
     uses = {stream.info_topic: "CameraInfo" for stream in streams.values() if stream.info_topic}
     colours = pair_colours(recording, list(streams.values()))
     for topic, stream in streams.items():

@@ -58,7 +58,7 @@ class Recording(ABC):
         return tuple(self._channels.values())
 
     def parts(self) -> list["Recording"]:
-        """Return one recording per file; only this one if it is a single file."""
+        """Return one recording for each file; for a single file, that is this recording."""
         return [self]
 
     def messages(
@@ -85,8 +85,8 @@ class Recording(ABC):
 
         Raises
         ------
-        RecordingError : the file cannot be read, or the recording is closed, even if that happens
-            between two messages.
+        RecordingError : the file cannot be read, or the recording is closed before or while its
+            messages are read.
         """
         self._require_open()
         with explained(f"{self.path}: cannot be read", RecordingError):

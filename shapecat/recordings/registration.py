@@ -42,7 +42,7 @@ def is_straight(lens: LensCamera, camera: Camera | None) -> bool:
 
 
 def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> bool:
-    """Return whether intrinsics differ by less than ``fraction`` of the image width in pixels."""
+    """Return whether the intrinsics differ by less than ``fraction`` of the image width, pixels."""
     if camera is None:
         return False
     intrinsics, camera_intrinsics = ((c.fx, c.fy, c.cx, c.cy) for c in (lens.pinhole, camera))

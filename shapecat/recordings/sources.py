@@ -55,7 +55,7 @@ class Source:
 
     @contextmanager
     def counting(self) -> Iterator[None]:
-        """Within the block, count unreadable messages by reason, and raise no error for them."""
+        """Within the block, count unreadable messages by reason instead of raising errors."""
         try:
             yield
         except (MessageError, *MALFORMED) as error:

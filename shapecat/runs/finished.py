@@ -73,8 +73,8 @@ def read_finished(folder: Path) -> FinishedRun:
 def find_runs(folders: Sequence[Path]) -> list[Path]:
     """Return the run folders among ``folders`` and directly below them, each once.
 
-    The runs below a folder are sorted by name. If there are folders, files are ignored, since the
-    pattern ``results/*`` matches the manifest of a batch, too.
+    The runs below a folder are sorted by name. Files beside folders in the list are ignored, since
+    the pattern ``results/*`` matches the manifest of a batch, too.
 
     Raises
     ------

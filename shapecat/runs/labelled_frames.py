@@ -91,10 +91,7 @@ class _MasksByFrame:
 
     @property
     def has_more(self) -> bool:
-        """Whether masks are left.
-
-        Their frames were then not requested, or in another order.
-        """
+        """Whether masks are left, because frames were not requested in the order of the table."""
         return self._next is not None
 
 

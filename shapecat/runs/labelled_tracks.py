@@ -128,9 +128,10 @@ def read_annotation_frames(
 ) -> Iterator[AnnotationFrame]:
     """Yield the annotations of a run, frame by frame in reading order.
 
-    Annotations lack points, surfaces and posteriors, and are read several times as fast as with
-    `shapecat.runs.labelled_frames.read_labelled_frames`. Their boxes are full boxes if these are
-    known and ``visible`` is False, else visible boxes. They are in the frame ``frame_id``.
+    Annotations have no points, surfaces and posteriors, so that reading them is several times as
+    fast as `shapecat.runs.labelled_frames.read_labelled_frames`. Their boxes are full boxes if
+    these are known and ``visible`` is False, else visible boxes. The boxes are in the frame
+    ``frame_id``.
 
     Raises
     ------

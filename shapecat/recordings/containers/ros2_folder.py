@@ -85,7 +85,7 @@ class FolderRecording(Recording):
         self._note()
 
     def _list_files(self) -> list[Path]:
-        """Return the files that belong to the bag."""
+        """Return the files of the bag; warn about missing ones, and those not in metadata.yaml."""
         files = [file for file in sorted(self.path.iterdir()) if file.is_file()]
         present = [file for file in files if _suffix(file) in _PARTS]
         in_metadata = self._listed_names()

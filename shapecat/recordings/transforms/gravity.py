@@ -173,8 +173,9 @@ class Upright:
     def _choose_fixed_frame(self, first: Frame) -> str | None:
         """Choose one fixed frame for all sensors, preferably one named map, odom or world.
 
-        Frames in which sensor poses are known halfway through the recording come first, since
-        objects are tracked there only if most frames have a pose. Returns None if there is none.
+        A coordinate frame in which sensor poses are known halfway through the recording is
+        preferred, since objects are tracked in it only if most images have a pose. Returns None if
+        there is no such frame.
         """
         halfway_ns = first.stamp_ns + max(0, self.middle_ns - first.log_time_ns)
         candidates = [

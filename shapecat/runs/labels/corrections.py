@@ -138,8 +138,8 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
     """Apply the labels of a corrected table to a run.
 
     Only the column ``label`` is applied. A table from a report page also has a column
-    ``label_seen`` with the labels that the page read; a label that was not changed there is not
-    applied, since other corrections may be newer. If labels are replaced, the previous table is
+    ``label_seen`` with the labels that the page read; a label that was not changed on the page is
+    not applied, since other corrections may be newer. If labels are replaced, the previous table is
     kept as tracks.previous.csv.
 
     Parameters
@@ -259,7 +259,9 @@ def _labelled(rows: Iterable[TrackRow], labels: Mapping[int, str]) -> tuple[Trac
 
 
 def has_labels(path: Path) -> bool:
-    """Return whether a table exists and has labels, or invalid lines, which may have some.
+    """Return whether a table has labels, or invalid lines, which may have labels.
+
+    A missing table has none.
 
     Raises
     ------

@@ -94,7 +94,7 @@ _Verdict = str | int | None
 def find_misread(
     rows: Sequence[TrackRow], categories: Iterable[str] = (), *, one_frame: bool = True
 ) -> dict[int, str]:
-    """Return the problem of each invalid or contradictory label, as `resolve_labels` does."""
+    """Return the problems of invalid labels by track number, see `resolve_labels`."""
     return resolve_labels(rows, categories, one_frame=one_frame)[1]
 
 
@@ -106,7 +106,8 @@ def resolve_labels(
     Parameters
     ----------
     categories : known categories, besides those in the rows.
-    one_frame : whether tracks of different topics may be merged, since they share a fixed frame.
+    one_frame : whether the topics share a fixed frame, so that tracks of different topics may be
+        merged.
 
     Returns
     -------
@@ -225,7 +226,10 @@ def _without_marks(text: str) -> str:
 
 
 def _nearest(name: str, names: Sequence[str]) -> str | None:
-    """Return the most similar name, at most one edit (short names) or two edits away, or None."""
+    """Return the most similar name, or None.
+
+    It is at most one edit away if one of the names is short, else at most two.
+    """
     distances = [(_slips(name, candidate), candidate) for candidate in names]
     slips, candidate = min(distances)
     return candidate if slips <= (1 if min(len(name), len(candidate)) < 5 else 2) else None

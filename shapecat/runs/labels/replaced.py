@@ -34,7 +34,7 @@ def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
     Labels of another recording are not transferred, since other objects may be at the same places.
 
     The replaced table is kept as tracks.previous.csv. If some labels cannot be transferred, a copy
-    is also put in the replaced folder under a name of its own, and so kept in all later results.
+    with a unique name is put in the replaced folder, since later results keep such files.
 
     Parameters
     ----------

@@ -65,7 +65,7 @@ def match_in_time(source: Path, target: Path, group: Group) -> Matches | None:
     Parameters
     ----------
     source, target : run folders of the same recording.
-    group : maps tracks of the source that were merged to the same number.
+    group : returns the same number for tracks of the source that a person merged.
     """
     old, new = read_track_detections(source), read_track_detections(target)
     common = sorted(old.keys.keys() & new.keys.keys())

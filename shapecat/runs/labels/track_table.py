@@ -1,7 +1,8 @@
 """tracks.csv: one line per track, to read and correct, for example in a spreadsheet.
 
 The table can be read as any spreadsheet saves it: with commas, semicolons or tabs, quotes, any line
-ends and order of columns, and numbers such as ``1.0``; without Unicode if the labels are ASCII.
+ends and order of columns, and numbers such as ``1.0``. If all labels are ASCII, it need not be
+Unicode.
 """
 
 import csv

@@ -70,7 +70,12 @@ class Transfer:
 
 
 def lost_labels(source: Path, reason: str) -> Transfer:
-    """Return the outcome if, for some ``reason``, no label of the run ``source`` is transferred.
+    """Return the outcome of a transfer in which no label could be transferred.
+
+    Parameters
+    ----------
+    source : the run folder with the labels.
+    reason : why they could not be transferred, for the user.
 
     Raises
     ------

@@ -64,7 +64,7 @@ def explain_misplacement(folder: Path, fixed_frame: str) -> Iterator[str]:
 def _compare(folder: Path) -> dict[str, list[bool]]:
     """Return, for each topic and each motion of its camera, whether poses are worse than none.
 
-    They are if objects move much farther in the fixed frame than relative to the sensor.
+    Poses are worse if objects move much farther in the fixed frame than relative to the sensor.
     """
     latest: dict[str, _Centers] = {}
     worse: dict[str, list[bool]] = {}

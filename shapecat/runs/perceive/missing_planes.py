@@ -55,8 +55,8 @@ def explain_missing_planes(recording: Recording, folder: Path, run: RunInfo) -> 
 def _reason(distances: Sequence[F4], range_m: float, source: str) -> str:
     """Return the likely reason why frames have no plane.
 
-    ``distances`` holds those (n,) of the points in each frame, metres; ``source`` is the source of
-    the up direction.
+    ``distances`` holds an array (n,) for each frame, the distances of its points in metres;
+    ``source`` is the source of the up direction.
     """
     if not distances:
         return "they have no valid depth"

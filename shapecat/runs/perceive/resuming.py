@@ -23,7 +23,7 @@ _LATER = ("tracking.", "outputs.")
 
 
 def require_resumable(job: Job, planned: RunInfo, digest: Callable[[], str]) -> None:
-    """Check that a job would not discard an interrupted run of other input, model or settings.
+    """Refuse a job that would discard an interrupted run of other input, model or settings.
 
     Runs of other versions, or of a recording that has changed since, may be discarded.
 
@@ -98,8 +98,8 @@ def take_over_frames(
 ) -> RunInfo:
     """Take over the perceived frames of a finished run that differs only in later phases.
 
-    Its frames are used, by links to its tables or copies, if settings of tracking or of outputs
-    differ, but nothing else. If nothing differs, the user wants everything computed again.
+    Its tables are linked or copied if settings of tracking or of outputs differ, but nothing else.
+    If nothing differs, the user wants everything computed again.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def _perception_differences(run: RunInfo, planned: RunInfo) -> dict[str, str]:
 
 
 def _with_perceived(planned: RunInfo, run: RunInfo) -> RunInfo:
-    """Return ``planned`` with the entries that perceiving sets, from another run."""
+    """Return ``planned`` with those entries of ``run`` that perceiving sets."""
     new, counts, seconds = planned.copy(), run["counts"].copy(), run["seconds"]
     counts.pop("tracks", None)
     if "perceive" in seconds:
@@ -188,7 +188,7 @@ def _same_recording_and_versions(
 
 
 def _is_complete(folder: Path, run: RunInfo) -> bool:
-    """Return whether *perceive* and *revise* are done and the tables have all counted rows."""
+    """Return whether *perceive* and *revise* are done, and the tables have all rows as counted."""
     counts = run["counts"]
     return (
         {"perceive", "revise"} <= run["seconds"].keys()

@@ -110,9 +110,10 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
 
 
 def _fixed_up(stream: _Stream, posed: Bool) -> F8:
-    """Return, in each sensor frame, the up direction (n, 3) on which most agree in the fixed frame.
+    """Return, for each frame, the up direction (n, 3) on which most frames agree.
 
-    It is NaN if they do not agree, and in frames without a pose.
+    The directions are compared in the fixed frame, and the result is in the sensor frame. It is NaN
+    if the frames do not agree, and for frames without a pose.
     """
     in_fixed = np.einsum("nij,nj->ni", stream.rotation, stream.up)
     agreed = _agreed(in_fixed[posed & stream.level], _OFF_DEG, _FIXED_SHARE)
@@ -139,7 +140,7 @@ def _around(stream: _Stream, k: int) -> I4:
 
 
 def _other_support(stream: _Stream, off: Bool) -> Bool:
-    """Return whether frames (n,) lack a plane at the height of the lowest ones of nearby frames.
+    """Return whether frames (n,) lack a plane at the height of the lowest planes nearby in time.
 
     ``off`` (n,) marks the frames that are not compared.
     """

@@ -76,7 +76,7 @@ def read_stamps(folder: Path) -> Iterator[tuple[Key, int]]:
 def read_by_topic(
     folder: Path, columns: Sequence[str], values: Callable[[pa.Table], Any]
 ) -> dict[str, Any]:
-    """Compute values from the frames table; return one array per topic, in its order of frames.
+    """Compute values from the frames table; return an array per topic, in the order of its frames.
 
     Parameters
     ----------
