@@ -138,7 +138,7 @@ class ContentDigest:
 
 
 def same_content(recorded: InputInfo, path: Path, digest: Callable[[], str]) -> bool:
-    """Return whether a recording has the content of the ``input`` in a run.json.
+    """Return whether the content of a recording is that of the entry ``input`` of a run.json.
 
     ``digest`` is called only if the names, sizes or times of the files differ.
     """

@@ -28,7 +28,7 @@ class TrackDetections(NamedTuple):
     ----------
     tracks, numbers, detections : (n,) track, frame and detection numbers.
     frames : the `_Moment` of each detection.
-    centers : (n, 3) metres, fixed frame.
+    centers : (n, 3) metres, in the fixed frame, or the sensor frame if there is none.
     keys : the rows of each `_Moment`.
     """
 
