@@ -28,7 +28,7 @@ _QOS = """- history: {history}
 
 
 class _Mcap:
-    """An MCAP file with ROS 2 messages, compressed with zstd; leaving ``with`` completes it."""
+    """An MCAP file of ROS 2 messages, compressed with zstd; use it in a ``with`` block."""
 
     def __init__(self, path: Path) -> None:
         self.messages = MessageFactory(2)
@@ -61,9 +61,10 @@ class _Mcap:
 
 
 class _Bag:
-    """A recording written by rosbags; leaving the ``with`` block completes it.
+    """A ROS bag that rosbags writes; use it in a ``with`` block.
 
-    ``options`` returns the options of a connection, given whether its topic is latched.
+    ``options`` is a function that returns the options of a connection. Its argument is whether the
+    topic is latched.
     """
 
     def __init__(
@@ -90,12 +91,12 @@ class _Bag:
 
 
 def _ros1(path: Path) -> _Bag:
-    """Return a ROS 1 bag."""
+    """Return a new ROS 1 bag."""
     return _Bag(1, Ros1File(path), lambda latched: {"latching": int(latched)})
 
 
 def _ros2(path: Path) -> _Bag:
-    """Return a ROS 2 bag: a folder with an SQLite database."""
+    """Return a new ROS 2 bag: a folder with an SQLite database."""
     file = Ros2Folder(path, version=8)
     return _Bag(2, file, lambda latched: {"offered_qos_profiles": [_qos(latched=latched)]})
 
@@ -115,13 +116,13 @@ def _qos(*, latched: bool) -> ros.Qos:
 
 
 Container: TypeAlias = _Mcap | _Bag
-"""A recording being written: its ``messages`` make what ``write`` appends, at a log time in ns."""
+"""A new recording: ``messages`` makes ROS messages, and ``write`` appends one to a topic."""
 
 FormatName = Literal["mcap", "ros1", "ros2"]
 
 
 class Format(NamedTuple):
-    """A recording format: the suffix of its files, and the function that begins a recording."""
+    """A recording format: the suffix of its files, and the function that opens a new recording."""
 
     suffix: str
     open: Callable[[Path], Container]

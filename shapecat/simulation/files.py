@@ -1,4 +1,4 @@
-"""The files of a simulated recording: their names, and labels that are written frame by frame."""
+"""The files of a simulated recording: their names, and the file of pixel labels."""
 
 import sqlite3
 import tempfile
@@ -20,7 +20,10 @@ __all__ = ["LabelFile", "completed", "written_paths"]
 
 
 def written_paths(out: Path, format: str, *, color: bool = False) -> list[Path]:  # noqa: A002  the word users know
-    """Return the paths that `simulate` writes: the recording, the ground truth, the labels."""
+    """Return the paths that `simulate` writes: the recording, the ground truth, and the labels.
+
+    With ``color``, the labels of the colour images come last.
+    """
     suffix = CONTAINERS[format].suffix
     out = out if out.suffix or not suffix else out.with_name(out.name + suffix)
     names = [out.name, f"{out.stem}.truth.json", f"{out.stem}.labels.npz"]
@@ -32,11 +35,12 @@ def written_paths(out: Path, format: str, *, color: bool = False) -> list[Path]:
 def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[list[Path]]:
     """Provide hidden paths; if the block succeeds, move the files written there to ``paths``.
 
-    The first path is the recording. ``obsolete`` files of an earlier one are then deleted.
+    The first path is the recording. Then delete the ``obsolete`` files, which an earlier recording
+    may have left.
 
     Raises
     ------
-    OutputError : the recording cannot be written, or its path is a folder of other files.
+    OutputError : the recording cannot be written, or its path is a folder with other files.
     """
     out = paths[0]
     try:
@@ -56,7 +60,7 @@ def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[li
 
 
 def _require_replaceable(path: Path) -> list[Path]:
-    """Return the files of a folder that a recording may replace; empty if it is not a folder.
+    """Return the files in a folder that a recording may replace; none if it is not a folder.
 
     Raises
     ------
@@ -70,7 +74,7 @@ def _require_replaceable(path: Path) -> list[Path]:
 
 
 def _move(hidden_path: Path, path: Path) -> None:
-    """Move a finished file or folder to its path, replacing a file or a recorded folder.
+    """Move a finished file or folder to its path; replace a file or ROS 2 bag that is there.
 
     Raises
     ------
@@ -85,7 +89,10 @@ def _move(hidden_path: Path, path: Path) -> None:
 
 
 class LabelFile:
-    """A compressed .npz with ``labels`` (t, h, w), uint8, written frame by frame."""
+    """A compressed .npz file of pixel labels, written frame by frame in a ``with`` block.
+
+    Its only array is ``labels`` (frames, h, w), uint8.
+    """
 
     def __init__(self, path: Path, frames: int, camera: Camera) -> None:
         self._archive = zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=4)

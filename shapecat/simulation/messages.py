@@ -17,7 +17,7 @@ __all__ = ["MessageFactory"]
 _TF = "tf2_msgs/msg/TFMessage"
 
 
-@cache  # it compiles the code of each message type that it writes
+@cache  # each type store compiles the code of its message types anew
 def _typestore(ros_version: int) -> Typestore:
     store = get_typestore(Stores.ROS1_NOETIC if ros_version == 1 else Stores.ROS2_HUMBLE)
     if _TF not in store.types:
@@ -26,7 +26,7 @@ def _typestore(ros_version: int) -> Typestore:
 
 
 class MessageFactory:
-    """Makes messages of one ROS version; their timestamps are in nanoseconds.
+    """Makes messages of one ROS version, with timestamps in nanoseconds.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class MessageFactory:
         )
 
     def cloud(self, points: F4, stamp_ns: int, frame_id: str) -> Any:
-        """Return points (h, w, 3), metres, NaN if missing, as an organized PointCloud2."""
+        """Return points (h, w, 3) in metres, NaN where missing, as an organized PointCloud2."""
         height, width, _ = points.shape
         data = np.zeros((height, width, 4), "<f4")
         data[..., :3] = points

@@ -55,17 +55,18 @@ def simulate(
 
     Topics: /camera/depth/image_raw (16UC1, mm) or /camera/depth/points, /camera/depth/camera_info,
     /tf (map, base_link, camera_link) and /tf_static. Beside the recording, ``NAME.truth.json``
-    lists the objects of each frame with their poses, and ``NAME.labels.npz`` holds the object of
-    each depth pixel. They replace the files of an earlier recording of this name. The same
+    lists the objects of each frame with their boxes, and ``NAME.labels.npz`` holds the label of
+    each depth pixel. These files replace those of an earlier recording of the same name. The same
     arguments give the same messages on every machine.
 
     Parameters
     ----------
     out : path of the recording; the suffix of the format is added if it has none.
+    sensor : name of a sensor in `SENSORS`.
     clouds : write organized point clouds instead of depth images.
     color : also write the images of a colour camera beside the depth camera:
         /camera/color/image_raw/compressed (JPEG), /camera/color/camera_info, its pose in
-        /tf_static, and ``NAME.color_labels.npz`` with the object of each colour pixel.
+        /tf_static, and ``NAME.color_labels.npz`` with the label of each colour pixel.
     rate_hz : frames per second.
     observe : called with the phase, the number of finished frames, and the total.
 
@@ -111,9 +112,9 @@ def record(
     rate_hz: float = 30.0,
     observe: Observer = ignore,
 ) -> Path:
-    """Write a recording of a world, as `simulate` does.
+    """Write a recording of a world, as `simulate` does; return its path.
 
-    ``seed`` seeds the sensor noise and names the scene in the ground truth.
+    ``seed`` seeds the sensor noise, and appears in the name of the scene in the ground truth.
 
     Raises
     ------
@@ -159,9 +160,14 @@ def write_frame(
     clouds: bool = False,
     color: bool = False,
 ) -> None:
-    """Write a depth image and its transforms; with the first frame, also the static transforms.
+    """Write the depth image, camera info and transforms of a frame.
 
-    ``clouds`` and ``color`` are as for `simulate`; the colour image is not written.
+    The first frame also writes the static transforms. ``clouds`` and ``color`` are as for
+    `simulate`, but no colour image is written.
+
+    Raises
+    ------
+    ValueError : the frame is not a depth image.
     """
     make, stamp, depth, camera = writer.messages, frame.stamp_ns, frame.depth, frame.camera
     if depth is None or camera is None:

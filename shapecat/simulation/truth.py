@@ -17,12 +17,15 @@ LISTED_PIXELS = 100
 AMBIGUOUS_PIXELS = 250
 """Objects with fewer visible depth pixels than this have an ambiguous category."""
 AMBIGUOUS_SHARE = 0.4
-"""The category is also ambiguous if less than this fraction of the side that faces the camera is
-visible."""
+"""The category of an object is also ambiguous if less than this fraction of its pixels is visible,
+compared with a view that nothing occludes."""
 
 
 def frame_truth(world: World, frame: int, labels: U1, camera: Camera) -> dict[str, Any]:
-    """Return the ``objects``, ``hidden`` objects and ``planes`` of a frame, as JSON values.
+    """Return the ground truth of a frame as JSON values.
+
+    The keys are ``objects``, ``hidden`` (objects with fewer than `LISTED_PIXELS` depth pixels) and
+    ``planes`` (the supports that hold objects).
 
     Parameters
     ----------

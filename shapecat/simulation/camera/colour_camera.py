@@ -1,4 +1,4 @@
-"""A colour camera beside the depth camera, with its own resolution and lens; textured scenes."""
+"""Images of a colour camera beside the depth camera, with its own lens, of textured scenes."""
 
 import io
 from functools import cache
@@ -22,20 +22,21 @@ COLOUR_LENS = LensCamera(
     "plumb_bob",
     (0.11, -0.24, 0.0007, -0.0004, 0.08),
 )
+"""Lens of the colour camera, with distortion; its field of view is 68 degrees wide."""
 DEPTH_FROM_COLOUR = Pose(
     rotation_from_quaternion((0.004, -0.009, 0.006, 1.0)), np.array([0.05, 0.0015, -0.002])
 )
-"""Like the colour camera of a RealSense: 5 cm to the right, rotated by a degree, wider."""
+"""Pose of the colour camera in the depth camera's frame: 5 cm to the right, rotated by a degree."""
 
 _NOTHING = 18
 """Value of red, green and blue where no surface is visible."""
 _GRAIN_M = 0.005
 _HASH_FACTORS = (73856093, 19349663, 83492791)
-"""Hash factors that give each cell of the grain one of its levels."""
+"""Factors of the spatial hash that gives each cell of the grain its brightness."""
 _BAND = 0.6
-"""Fraction of a band that has the first of its two colours."""
+"""Fraction of a band's width in the first of its two colours."""
 _FINE = 2
-"""Oversampling of the pinhole image from which the distorted image is sampled."""
+"""Oversampling factor of the pinhole image from which the distorted image is sampled."""
 
 
 def render_colour(world: World, frame: int) -> tuple[U1, U1]:
@@ -55,7 +56,10 @@ def render_colour(world: World, frame: int) -> tuple[U1, U1]:
 
 @cache
 def _distortion_map() -> tuple[Camera, I4, I4]:
-    """Return a finer pinhole camera, and its row and column (h, w) for each pixel of the lens."""
+    """Return a finer pinhole camera, and the pixel of it that each pixel of the lens camera shows.
+
+    The pixels are two arrays (h, w): rows and columns.
+    """
     camera = COLOUR_LENS.pinhole
     rays = np.asarray(undistorted_rays(camera, COLOUR_LENS.model, COLOUR_LENS.coefficients))
     fx, fy = _FINE * camera.fx, _FINE * camera.fy
@@ -71,7 +75,7 @@ def _distortion_map() -> tuple[Camera, I4, I4]:
 def _paint(
     world: World, frame: int, pose: Pose, camera: Camera, image: Image, rows: I4, columns: I4
 ) -> U1:
-    """Return the shaded colours (h, w, 3) uint8; the texture moves with each object.
+    """Return the shaded colours (h, w, 3), uint8, of an image; textures move with their objects.
 
     ``pose`` is ``world_from_camera``; the other parameters are as for `_colour_in`.
     """
@@ -91,9 +95,10 @@ def _paint(
 
 
 def _texture(number: int, *, plain: bool) -> F8:
-    """Draw the texture (3, 3) of an object: two colours, 0 to 255, and its bands.
+    """Draw the texture (3, 3) of a mesh: two colours, 0 to 255, and its bands.
 
-    The last row is the direction across the bands, divided by their distance, 1/m.
+    The last row is the direction across the bands, divided by their spacing, 1/m. The two colours
+    of a ``plain`` texture are similar.
     """
     rng = np.random.default_rng(number + 71)
     tone = rng.uniform(90, 180, 3) if plain else rng.uniform(30, 235, 3)
@@ -122,8 +127,8 @@ def _colour_in(
     Parameters
     ----------
     inverse_depth, mesh_ids, cosine : the rendered image: inverse depth (1/m), index of the visible
-        mesh, -1 without surface, and cosine of the angle of incidence.
-    rows, columns : (h, w) the pixel of that image to show in each pixel of ``colours``.
+        mesh (-1 without surface), and cosine of the angle of incidence.
+    rows, columns : (h, w) pixel of that image to show in each pixel of ``colours``.
     intrinsics : fx, fy, cx, cy of the rendered image, pixels.
     rotations, translations : (k, 3, 3) and (k, 3) from the camera to the frame of each texture,
         metres.

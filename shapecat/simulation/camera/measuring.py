@@ -12,9 +12,9 @@ from shapecat.simulation.camera.sensors import Sensor
 __all__ = ["measure"]
 
 _DISCONTINUITY = 0.03
-"""Discontinuity of the inverse depth that separates two surfaces, 1/m."""
+"""Minimum discontinuity of the inverse depth between two surfaces, 1/m."""
 _MARGIN_DISCONTINUITY = 0.07
-"""Discontinuity of the inverse depth beside which stereo matching fails, 1/m."""
+"""Minimum discontinuity of the inverse depth beside which stereo matching fails, 1/m."""
 
 
 def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
@@ -102,7 +102,7 @@ def _scaled_by_reflectance(cosine: F4, mesh_ids: I4, sensor: Sensor) -> F4:
 
 
 def _drop_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> None:
-    """Mark missing depth on oblique surfaces."""
+    """Mark oblique surfaces as ``lost``; ``cosine`` (h, w) is that of the angle of incidence."""
     if sensor.grazing_cosine > 0:
         window = (sensor.hole_px, sensor.hole_px)
         threshold_noise = noise(cosine.shape, window, 0.5 * sensor.grazing_cosine, rng)
@@ -118,7 +118,7 @@ def _drop_border(sensor: Sensor, lost: Bool) -> None:
 
 
 def _drop_random_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
-    """Mark missing depth in random holes."""
+    """Mark random holes as ``lost``."""
     area = 0.32 * (sensor.hole_px + 2) ** 2  # about the mean of width times height
     count = rng.poisson(sensor.holes * lost.size / area) if sensor.holes > 0 else 0
     rows = rng.integers(0, lost.shape[0], count)
@@ -129,7 +129,7 @@ def _drop_random_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
 
 
 def _smoothed_surfaces(inverse: F8, width: int) -> F8:
-    """Average the inverse depth over a window within each surface, which rounds its edges."""
+    """Average the inverse depth over a window within each surface, which rounds its corners."""
     for _ in range(2):  # along the rows, then along the columns
         along = np.zeros_like(inverse)
         _smooth(inverse, width // 2, along)
@@ -146,7 +146,10 @@ def _blended_edges(inverse: F8, width: int) -> F8:
 
 @kernel
 def _write_depth(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, mesh_ids: I4) -> None:
-    """Write the depth with its error, quantized, where it is within the limits."""
+    """Write the quantized depth, metres, with its error; without depth, set the mesh id to -1.
+
+    ``limits`` are the step of the inverse depth and the least and the greatest depth.
+    """
     step, nearest, farthest = limits
     for v in range(inverse.shape[0]):
         for u in range(inverse.shape[1]):
@@ -166,7 +169,10 @@ def _write_depth(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, mesh
 def _sample_beside(
     inverse: F8, mesh_ids: I4, cosine: F4, across: F4, down: F4, out: F8, ids_out: I4, cos_out: F4
 ) -> None:
-    """Sample at displaced pixels; fill ``out``, ``ids_out`` and ``cos_out``."""
+    """Sample the image at displaced pixels into ``out``, ``ids_out`` and ``cos_out``.
+
+    ``across`` and ``down`` (h, w) are the displacements, pixels.
+    """
     height, width = inverse.shape
     for v in range(height):
         for u in range(width):
@@ -183,7 +189,7 @@ def _sample_beside(
 
 @kernel
 def _drop_margins(inverse: F8, width: int, lost: Bool) -> None:
-    """Mark missing depth up to ``width`` rows and columns beside a nearer surface."""
+    """Mark pixels up to ``width`` rows and columns beside a nearer surface as ``lost``."""
     height, columns = inverse.shape
     nearest = np.zeros(inverse.shape)
     for v in range(height):
@@ -203,7 +209,7 @@ def _drop_margins(inverse: F8, width: int, lost: Bool) -> None:
 
 @kernel
 def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
-    """Mark pixels that are occluded from a second viewpoint beside the camera.
+    """Mark pixels whose points are occluded from a second viewpoint beside the camera.
 
     ``shift`` is the viewpoint's x position in metres times the focal length in pixels.
     """
@@ -233,9 +239,9 @@ def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
 
 @kernel
 def _fill_shadow(inverse: F8, mesh_ids: I4, shadow: Bool, growth_px: I4) -> None:
-    """Grow the nearer side of each shadow into it, as the windows of stereo matching do.
+    """Extend the surface on the nearer side of each shadow into it, as stereo matching does.
 
-    ``growth_px`` (h // 3 + 1, 16) holds the widths of this growth, which vary over the image.
+    ``growth_px`` (h // 3 + 1, 16) holds the widths of the extension, which vary over the image.
     """
     height, width = inverse.shape
     for v in range(height):

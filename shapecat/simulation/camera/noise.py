@@ -21,10 +21,11 @@ def noise(
 ) -> F4:
     """Return nearly normal noise (h, w), correlated over a window (across, down) in pixels.
 
-    It is a sum of random bytes, which is many times faster than normal numbers.
+    The noise is a sum of random bytes, which are many times faster to draw than normal numbers.
 
     Parameters
     ----------
+    shape : (h, w).
     deviation : standard deviation of the noise.
     smoothings : how often the noise is averaged over the window.
     """
@@ -43,7 +44,7 @@ def noise(
 
 
 def _gain(width: int, times: int) -> float:
-    """Return the factor by which repeated sums over a window raise a standard deviation."""
+    """Return the factor by which repeated sums over a window raise the standard deviation."""
     weights = np.ones(1)
     for _ in range(times):
         weights = np.convolve(weights, np.ones(width))
@@ -52,7 +53,7 @@ def _gain(width: int, times: int) -> float:
 
 @lru_cache(maxsize=8)
 def fixed_error(shape: tuple[int, int], deviation: float, spacing: int, device: int) -> F4:
-    """Return the fixed error (h, w) of a device, 1/m: smooth, and the same in every image.
+    """Return the fixed error (h, w) of a device's inverse depth, 1/m, which is smooth.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Presets of depth cameras: their intrinsics and error models.
 
 The parameters of the Kinect and the RealSense D435 are fitted to real images of tables with
-objects. Those of the other cameras follow data sheets and the cited measurements. Real images also
-gave the low-frequency noise, margins and smoothing of the D4xx and the SR300.
+objects, and so are the low-frequency error, margins and smoothing of the D4xx and the SR300. All
+other parameters follow data sheets and the cited measurements.
 """
 
 from dataclasses import replace
@@ -130,7 +130,8 @@ _D415 = replace(
     shadow_m=(0.055,),
     border_px=(14, 0, 0, 0),
 )
-"""Intel D415: disparity noise of 0.08 px at 615 px and 55 mm; source as for the D435."""
+"""Intel D415: disparity noise of 0.08 px, focal length of 615 px, baseline of 55 mm; source as for
+the D435."""
 
 _D455 = replace(
     _D435,
@@ -151,7 +152,8 @@ _D455 = replace(
     smoothing_px=17,
     border_px=(30, 0, 0, 0),
 )
-"""Intel D455: disparity noise of 0.15 px at 640 px and 95 mm; source as for the D435."""
+"""Intel D455: disparity noise of 0.15 px, focal length of 640 px, baseline of 95 mm; source as for
+the D435."""
 
 _SR300 = Sensor(
     _camera(640, 480, 475.0),
@@ -207,7 +209,7 @@ _PHONE = Sensor(
     blend_px=3,
     smoothing_px=5,
 )
-"""Lidar of a phone, which the phone densifies with its colour image to 256 x 192, without holes:
+"""Lidar of a phone, densified to 256 x 192 pixels without holes by means of the colour image:
 Luetzenburg et al., Evaluation of the Apple iPhone 12 Pro LiDAR, 2021."""
 
 PRESETS = {
@@ -222,7 +224,7 @@ PRESETS = {
     "l515": _L515,
     "phone": _PHONE,
 }
-"""Real depth cameras by name. Append new ones: the order decides the sensors of training frames."""
+"""Real depth cameras by name. Append new ones: their order determines the sensors of training."""
 
 SENSORS = {"ideal": IDEAL, **PRESETS}
 """All sensors by name."""

@@ -14,7 +14,7 @@ from shapecat.types import Camera, Pose
 __all__ = ["Geometry", "Image", "alone_pixels", "cropped", "geometry", "render"]
 
 NEAR_M = 0.02
-"""Triangles with a corner nearer than this, in metres, are tested in every pixel of the image."""
+"""A triangle is skipped if all corners are nearer than this; if some are, all pixels are tested."""
 
 
 class Geometry(Record):
@@ -66,16 +66,16 @@ def geometry(meshes: list[tuple[Mesh, Pose]]) -> Geometry:
 
 
 def render(scene: Geometry, camera: Camera, frame_from_camera: Pose) -> Image:
-    """Render triangles, visible from both sides, with a z-buffer.
+    """Render triangles, which are visible from both sides, with a z-buffer.
 
     The inverse depth of a plane is linear in the image. A ray hits a triangle if it is on the same
     side of the three planes through the camera and the triangle's edges. Triangles need no
-    clipping, and neighbours have no gap.
+    clipping, and no gap opens between neighbours.
 
     Parameters
     ----------
     scene : triangles in any frame.
-    frame_from_camera : pose of the optical frame in this frame.
+    frame_from_camera : pose of the optical frame in the frame of ``scene``.
 
     Notes
     -----
@@ -98,15 +98,15 @@ def render(scene: Geometry, camera: Camera, frame_from_camera: Pose) -> Image:
 
 
 def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
-    """Return the intrinsics of a crop with the given corner and size in pixels."""
+    """Return the intrinsics of a crop, given its top left corner and its size in pixels."""
     return Camera(width, height, camera.fx, camera.fy, camera.cx - left, camera.cy - top)
 
 
 def alone_pixels(scene: Geometry, mesh_id: int, camera: Camera, frame_from_camera: Pose) -> int:
-    """Count the pixels of one mesh, unoccluded, in an image three times as wide and high.
+    """Count the pixels that a mesh would have if nothing occluded it.
 
-    The count is 0 if a vertex is behind the camera or nearer than `NEAR_M`. ``scene`` and
-    ``frame_from_camera`` are as for `render`.
+    Pixels up to one image width or height beyond the image border count, too. The result is 0 if a
+    vertex has a depth below `NEAR_M`. ``scene`` and ``frame_from_camera`` are as for `render`.
     """
     triangles = scene.triangles[scene.mesh_ids == mesh_id]
     if len(triangles) == 0:
@@ -148,10 +148,11 @@ def _rasterize(
     triangle_ids: I4,
     normals: F8,
 ) -> None:
-    """Find the nearest triangle of each pixel, and its inverse depth, 1/m.
+    """Find the nearest triangle of each pixel, and the normal of each triangle.
 
-    ``points`` (n, 3) are in the optical frame; ``intrinsics`` are fx, fy, cx, cy in pixels. Fills
-    ``nearest`` (inverse depth) and ``triangle_ids`` (h, w), and the ``normals`` (m, 3).
+    ``points`` (n, 3) are in the optical frame, metres; ``intrinsics`` are fx, fy, cx, cy in pixels.
+    Write the inverse depth (1/m) into ``nearest`` (h, w) and the triangles into ``triangle_ids``
+    (h, w) where a pixel shows one, and the normals into ``normals`` (m, 3).
     """
     height, width = nearest.shape
     fx, fy, cx, cy = intrinsics
@@ -171,7 +172,7 @@ def _rasterize(
             top = max(top, int(np.ceil(fy * min(v0, v1, v2) + cy)))
             bottom = min(bottom, int(np.floor(fy * max(v0, v1, v2) + cy)))
             u0, u1, u2 = ax / az, bx / bz, dx / dz
-            # One pixel of margin: the spans below decide, with the same rounding for neighbours.
+            # A pixel of margin: the spans below decide, and round alike for neighbours.
             left = max(left, int(np.floor(fx * min(u0, u1, u2) + cx)))
             right = min(right, int(np.ceil(fx * max(u0, u1, u2) + cx)))
             if top > bottom or left > right:

@@ -17,28 +17,28 @@ class Sensor:
     Attributes
     ----------
     camera : intrinsics.
-    nearest_m, farthest_m : depth range.
+    nearest_m, farthest_m : limits of the measured depth.
     step : quantization of the inverse depth, 1/m; 0 is none.
     noise : standard deviation of the inverse depth, 1/m, for cameras that triangulate.
-    noise_m : standard deviation of the depth of time-of-flight cameras, metres per metre.
+    noise_m : standard deviation of the depth, relative to the depth, for time-of-flight cameras.
     noise_window : (across, down) correlation window of the noise, pixels.
     smoothings : how often the noise and the edge jitter are averaged over their windows.
-    fixed_error : standard deviation of the low-frequency error of the device, which is the same in
-        all images, in inverse depth, 1/m.
+    fixed_error : standard deviation of the device's low-frequency error of the inverse depth, 1/m;
+        the error is the same in all images.
     fixed_error_px : distance over which this error varies, pixels.
     device : seed of the fixed error and of the objects' reflectance.
     edge_jitter_px : standard deviation of the displacement of depth edges, pixels.
     edge_jitter_window : (across, down) correlation window of this displacement, pixels.
-    shadow_m : x positions of the light source and the other cameras, metres; depth is missing where
-        one of them is occluded.
-    shadow_fill_px : mean width by which shadows are narrower than geometry predicts, pixels.
-    grazing_cosine : cosine of the angle of incidence at which half of the depth is missing.
+    shadow_m : x positions of the light source and of other cameras, relative to this one, metres;
+        depth is missing at points that one of them does not see.
+    shadow_fill_px : mean width by which these shadows are narrower than geometry predicts, pixels.
+    grazing_cosine : cosine of the angle of incidence at which half of the pixels lack depth.
     log_reflectance_std : standard deviation of the logarithm of the objects' reflectance; on dark
         objects, depth is missing at smaller angles of incidence.
     stereo_margin_px : width of the margins around nearer surfaces in which stereo matching fails,
         pixels.
     holes : approximate fraction of the pixels in random holes.
-    hole_px : approximate width of the largest holes, even of those on oblique surfaces, pixels.
+    hole_px : approximate width of the largest holes, including those on oblique surfaces, pixels.
     blend_px : window that mixes near and far at depth edges (flying pixels), pixels; 0 is none.
     smoothing_px : window that rounds edges and corners within a surface (multipath, smoothing
         windows), pixels; 0 is none.

@@ -29,6 +29,7 @@ def render_frame(
     view : index of a frame of the world's path, or a pose ``world_from_camera`` from which to see
         the world of frame 0.
     rng : generator of the sensor noise.
+    rate_hz, start_ns : frames per second, and timestamp of frame 0.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Background of rooms: robot arms, people, screens, chairs, curtains, plants, cables."""
+"""Background objects of rooms: robot arms, people, screens, chairs, curtains, plants, cables."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -76,7 +76,7 @@ def make_own_arms(rng: Generator, camera: Pose, height: float) -> list[Mesh]:
 def make_resting_arms(
     rng: Generator, camera: Pose, intrinsics: Camera, height: float
 ) -> list[Mesh]:
-    """Return arms that lie on a support or just above it, cut off by the image border.
+    """Return arms on a support or just above it, which enter the image from its border.
 
     Parameters
     ----------
@@ -98,9 +98,10 @@ def make_resting_arms(
 
 
 def _on_support(uv: ArrayLike, camera: Pose, intrinsics: Camera, height: float) -> F8:
-    """Return the point (3,) of a support that a pixel shows, at most 2 m away.
+    """Return the point (3,) of a support that a pixel shows, at a depth of at most 2 m.
 
-    ``uv`` is the column and row of the pixel, as fractions of the image size.
+    ``uv`` is the column and the row of the pixel, as fractions of the image size. ``camera`` and
+    ``height`` are as for `make_resting_arms`.
     """
     u, v = np.asarray(uv, float) * [intrinsics.width, intrinsics.height]
     ray = [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, 1.0]
@@ -112,7 +113,7 @@ def _on_support(uv: ArrayLike, camera: Pose, intrinsics: Camera, height: float) 
 
 
 def _resting_arm(rng: Generator, start: F8, end: F8) -> list[Mesh]:
-    """Return a forearm from ``start`` (3,) to a hand or gripper at ``end`` (3,), on a support."""
+    """Return a forearm on a support, from ``start`` (3,) to a hand or gripper at ``end`` (3,)."""
     thick, rise, gap = rng.uniform(0.03, 0.08), rng.uniform(0, 0.25), rng.uniform(-0.005, 0.05)
     kind = rng.random()
     if kind < 0.25:
@@ -205,7 +206,7 @@ def make_chair(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Mesh
 
 
 def make_curtain(rng: Generator, width: float, place: ArrayLike) -> Mesh:
-    """Return a folded curtain along x, 2.2 m high.
+    """Return a pleated curtain along x, 2.2 m high.
 
     Its lower edge is centred at ``place`` (3,); lengths are in metres.
     """
@@ -268,5 +269,5 @@ def _above(place: F8, height: float) -> F8:
 
 def _put(mesh: Mesh, place: ArrayLike, degrees: float) -> Mesh:
     """Turn a mesh about z and move it."""
-    # In one step, coordinates would be rounded only once, which would change recordings.
+    # A single step would round coordinates only once, and thus change recordings.
     return placed(placed(mesh, about="z", degrees=degrees), place)

@@ -29,7 +29,7 @@ class Footprint(Record):
     high: float
 
     def moved(self, turn: Pose) -> "Footprint":
-        """Return the footprint of the object after a turn about z and a shift."""
+        """Return the footprint of the object after ``turn``, which must be about the z axis."""
         about_z, (x, y, z) = turn.rotation[:2, :2].T, turn.translation
         outline, contact, top = (
             flat @ about_z + (x, y) for flat in (self.outline, self.contact, self.top)
@@ -49,7 +49,9 @@ def footprint(mesh: Mesh, world_from_mesh: Pose) -> Footprint:
 def overlap(a: F8, b: F8, gap: float) -> bool:
     """Return whether two convex outlines ``a`` (k, 2) and ``b`` (m, 2) are closer than ``gap``.
 
-    Source: separating axis theorem; the distance between two corners is not considered.
+    Outlines that are nearest at two corners may count as closer than they are.
+
+    Source: separating axis theorem.
     """
     for one, other in ((a, b), (b, a)):
         normals = _normals(one)

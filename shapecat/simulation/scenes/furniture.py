@@ -72,7 +72,7 @@ def round_table(radius: float, height: float, thick: float) -> Support:
 def make_shelf(
     width: float, depth: float, low: float, step: float
 ) -> tuple[list[Support], list[Support]]:
-    """Return three shelf boards, ``width`` by ``depth``, and the two sides and the back.
+    """Return the three boards of a shelf, ``width`` by ``depth``, and its two sides and back.
 
     The lowest board is at z = ``low``; the spacing of the boards is ``step``.
     """
@@ -92,9 +92,9 @@ def make_shelf(
 
 
 def make_rack(rng: Generator, supports: Sequence[Support]) -> list[Support]:
-    """Return the ``supports`` of a shelf with posts instead of the sides.
+    """Return the ``supports`` of a shelf with four posts instead of its sides.
 
-    The back is kept with probability 1/3.
+    The back stays with a probability of 1/3.
     """
     points = np.concatenate([s.mesh.vertices for s in supports if s.name.startswith("board")])
     wide = rng.uniform(0.012, 0.05, 2)
@@ -136,7 +136,10 @@ def make_tote(rng: Generator, supports: Sequence[Support]) -> list[Support]:
 
 
 def _rim(half: F8, wide: float, height: float) -> Iterator[Support]:
-    """Yield the four boards of a rim around a bin of half size ``half`` (2,)."""
+    """Yield the four boards of a rim, ``wide`` metres wide, around a bin.
+
+    ``half`` (2,) is half the length and width of the bin; ``height`` is that of its top.
+    """
     for name, axis, side in (("left", 0, -1), ("right", 0, 1), ("near", 1, -1), ("far", 1, 1)):
         size, place = 2 * half + 2 * wide, np.zeros(2)
         size[axis], place[axis] = wide, side * (half[axis] + wide / 2)
@@ -144,9 +147,9 @@ def _rim(half: F8, wide: float, height: float) -> Iterator[Support]:
 
 
 def _widened(mesh: Mesh, half: F8, slope: float, height: float) -> Mesh:
-    """Return a mesh whose horizontal extent grows with ``slope`` above ``height``, metres.
+    """Lean the side of a bin outwards by ``slope``, in metres per metre above ``height``.
 
-    ``half`` (2,) are half the length and width of the bin about the z axis.
+    ``half`` (2,) is half the length and width of the bin, whose middle is on the z axis.
     """
     points = mesh.vertices.astype(np.float64)
     points[:, :2] *= 1 + slope * np.maximum(points[:, 2:] - height, 0) / half
@@ -188,11 +191,11 @@ def _upright(name: str, label: int, size: Sequence[float], place: Sequence[float
 
 
 def _board(name: str, label: int, size: Sequence[float], place: Sequence[float]) -> Support:
-    """Return a board that supports nothing; ``place`` (3,) is the centre of its lower face."""
+    """Return a board that holds no objects; ``place`` (3,) is the centre of its lower face."""
     shift = Pose(np.eye(3), np.array(place, np.float64))
     return Support(name, label, moved(rounded_box(size, fine=1), shift))
 
 
 def as_equipment(name: str, meshes: Sequence[Mesh]) -> list[Support]:
-    """Return meshes, in the world frame, as parts of the scene that support nothing."""
+    """Return meshes in the world frame as supports that hold no objects."""
     return [Support(f"{name}_{k}", EQUIPMENT, mesh) for k, mesh in enumerate(meshes)]

@@ -38,19 +38,22 @@ SceneKind = Literal[
 
 @dataclass(frozen=True)
 class _SceneSpec:
-    """Frames and frame rate of a scene, and the categories to draw from."""
+    """Number of frames and frame rate of a scene, and the categories to draw from."""
 
     filming: Filming
     categories: tuple[str, ...]
 
     def draw(self, rng: Generator, count: int, *, unknown: int = 0) -> list[str]:
-        """Return ``count`` categories, each once before any repeats, then the unknown objects."""
+        """Draw ``count`` categories; add ``unknown`` times the category ``unknown``.
+
+        No category repeats before all have appeared.
+        """
         first = [str(c) for c in rng.permutation(self.categories)]
         more = [str(c) for c in rng.choice(self.categories, max(0, count - len(first)))]
         return [*(first + more)[:count], *["unknown"] * unknown]
 
     def draw_shuffled(self, rng: Generator) -> list[str]:
-        """Return the categories of 4 to 18 objects in random order, one in six unknown."""
+        """Draw the categories of 4 to 18 objects, one in six unknown, in random order."""
         count = int(rng.integers(4, 19))
         drawn = self.draw(rng, count - count // 6, unknown=count // 6)
         return [str(category) for category in rng.permutation(drawn)]
@@ -69,7 +72,8 @@ def make_scene(
     Parameters
     ----------
     frames, rate_hz : number of frames, and frames per second; the objects do not depend on them.
-    categories : categories to draw from; each appears at least once where there is room.
+    categories : categories to draw from; each appears at least once if the scene has room for
+        enough objects.
 
     Raises
     ------
@@ -82,7 +86,7 @@ def make_scene(
 
 
 def _tabletop(rng: Generator, spec: _SceneSpec) -> World:
-    """Place six to ten objects on a table with gaps, at least one of each category."""
+    """Place up to ten objects, with gaps, on a table: at least one of each category."""
     room, table = make_room(rng, wall_chance=0.3), make_table(rng)
     layout = Layout(rng, gap=rng.uniform(0.015, 0.05))
     count = int(rng.integers(max(6, len(spec.categories)), 11))
@@ -96,7 +100,7 @@ def _tabletop(rng: Generator, spec: _SceneSpec) -> World:
 
 
 def _clutter(rng: Generator, spec: _SceneSpec) -> World:
-    """Crowd objects on a table: nearly touching, stacked, and occluding each other."""
+    """Crowd a table with objects that nearly touch, are stacked, and occlude each other."""
     room, table = make_room(rng, wall_chance=0.2), make_table(rng)
     layout = Layout(rng, gap=0.01)
     half = rng.uniform([0.2, 0.16], [0.32, 0.24])
@@ -113,7 +117,7 @@ def _clutter(rng: Generator, spec: _SceneSpec) -> World:
 
 
 def _shelf(rng: Generator, spec: _SceneSpec) -> World:
-    """Place twelve objects on three boards of a shelf, some stacked."""
+    """Place about twelve objects on three boards of a shelf, some of them stacked."""
     width, depth = rng.uniform(0.85, 1.15), rng.uniform(0.3, 0.42)
     low, step = rng.uniform(0.25, 0.4), rng.uniform(0.33, 0.42)
     boards, sides = make_shelf(width, depth, low, step)
@@ -130,7 +134,7 @@ def _shelf(rng: Generator, spec: _SceneSpec) -> World:
 
 
 def _turntable(rng: Generator, spec: _SceneSpec) -> World:
-    """Rotate a round table in front of a static camera."""
+    """Rotate a round table with objects in front of a static camera."""
     room = make_room(rng, wall_chance=0.3)
     table = round_table(rng.uniform(0.38, 0.48), rng.uniform(0.65, 0.85), 0.03)
     layout = Layout(rng, gap=0.03)
@@ -145,7 +149,7 @@ def _turntable(rng: Generator, spec: _SceneSpec) -> World:
 
 
 def _empty(rng: Generator, spec: _SceneSpec) -> World:
-    """Show an empty table."""
+    """Return a scene of an empty table."""
     room, table = make_room(rng, wall_chance=0.5), make_table(rng)
     target = np.array([0, 0, table.height])
     path = arc_orbit(
@@ -169,4 +173,4 @@ SCENES: dict[str, Callable[[Generator, _SceneSpec], World]] = {
     "rearranged": lambda rng, spec: rearranged(rng, spec.draw(rng, 8), spec.filming),
     "empty": _empty,
 }
-"""The function that makes each kind of scene."""
+"""The function that makes a random scene of each kind."""

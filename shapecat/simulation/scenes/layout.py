@@ -18,7 +18,7 @@ from shapecat.types import Pose
 __all__ = ["SUPPORTING", "Layout", "Piece", "make_piece", "place_piece"]
 
 _LYING = {"can": 0.2, "bottle": 0.22, "cup": 0.12, "box": 0.7}
-"""Probability that an object of a category lies; a box lies on any face."""
+"""Probability that an object of a category lies; a lying box rests on any of its sides."""
 _UPSIDE_DOWN = {"cup": 0.06, "bowl": 0.06, "plate": 0.03}
 """Probability that an open object stands on its rim."""
 _WIDEST_M = 0.42
@@ -63,7 +63,7 @@ def make_piece(category: str, rng: Generator, *, resting_pose: str | None = None
 def place_piece(
     piece: Piece, track: int, pose: Pose, support: Support, on_track: int | None
 ) -> PlacedObject:
-    """Return a piece as the object number ``track`` of a world.
+    """Return a piece as a placed object with the number ``track``.
 
     Parameters
     ----------
@@ -122,7 +122,8 @@ class Layout:
 
         Parameters
         ----------
-        half : (2,) half the size along x and y, metres, of the area around the support's centre.
+        half : (2,) half the size along x and y, metres, of the area in which to place it, around
+            the support's centre.
         stack : probability of placing it on another object.
         attempts : number of objects to make and try before giving up.
         """
@@ -191,7 +192,7 @@ class Layout:
         return False
 
     def _random_yaw_pose(self, place: F8) -> Pose:
-        """Return a random turn about z that moves the origin to ``place`` (3,)."""
+        """Return a pose with a random yaw and the translation ``place`` (3,)."""
         angle = self._rng.uniform(0, 2 * np.pi)
         return pose_from_yaw(angle, np.round(place, 6))
 
@@ -222,6 +223,6 @@ class Layout:
 
 
 def _supports(below: Footprint, above: Footprint) -> bool:
-    """Return whether the central 60 % of the upper object's contact lies on the lower one's top."""
+    """Return whether the middle 60 % of the upper contact area lies on the top face below."""
     middle = above.contact.mean(axis=0)
     return inside(middle + 0.6 * (above.contact - middle), below.top, 0.002)

@@ -16,15 +16,16 @@ from shapecat.types import Pose
 __all__ = ["crossing", "rearranged", "walking"]
 
 _ANYWHERE = np.array([0.6, 0.3])
-"""Half the size of an area around any strip; positions outside the strip are rejected."""
+"""Half the size in x and y of an area that covers any strip; `Layout.put` draws positions in it and
+rejects those outside the strip."""
 _MOVERS = ("ball", "can", "cup", "bottle", "box")
-"""Categories of moving objects, most of which fit on a lane."""
+"""Categories of moving objects; most of their objects are narrow enough for a lane."""
 
 
 def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Return a counter with objects of these categories; the camera moves along it and back.
+    """Return a scene of a counter with objects of these categories.
 
-    Objects leave the view and come back.
+    The camera moves along the counter and back, so that objects leave the view and return.
     """
     room, counter = make_room(rng, wall_chance=0.0), make_counter(rng)
     layout = Layout(rng, gap=rng.uniform(0.02, 0.05))
@@ -40,9 +41,10 @@ def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> Worl
 
 
 def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Return two rows of objects of these categories, and two objects that slide between them.
+    """Return a scene of two rows of objects, between which two further objects slide.
 
-    The moving objects occlude the others and each other.
+    ``categories`` are those of the objects at rest. The moving objects occlude the others and each
+    other.
     """
     room, table = make_room(rng, wall_chance=0.3), make_table(rng, (1.3, 0.85))
     layout = Layout(rng, gap=0.02, enclosed=True)
@@ -66,9 +68,10 @@ def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> Wor
 
 
 def rearranged(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Return a table with objects of these categories, four of which move.
+    """Return a scene of a table, four of whose objects change.
 
     One object is added, one is removed, one is carried to another position, and one is pushed.
+    ``categories`` are those of all objects except the pushed one.
     """
     room, table = make_room(rng, wall_chance=0.3), make_table(rng, (1.3, 0.85))
     layout = Layout(rng, gap=0.04)
@@ -112,7 +115,7 @@ def _orbit_table(
 
 
 def _strip(support: Support, x: tuple[float, float], y: tuple[float, float]) -> Support:
-    """Return a support limited to ranges of x and y, metres, for placing objects."""
+    """Return a copy of a support that holds objects only within ranges of x and y, metres."""
     corners = [[x[0], y[0]], [x[1], y[0]], [x[1], y[1]], [x[0], y[1]]]
     return replace(support, outline=np.column_stack([corners, np.full(4, support.height)]))
 
@@ -122,13 +125,19 @@ def _shifted(track: int, along: F8) -> Motion:
 
 
 def _pushed(track: int, start: F8, t: F8) -> Motion:
-    """Return the motion of an object pushed 0.4 m along its lane, at 0.2 m/s, from t = 0."""
+    """Return the motion of an object that is pushed 0.4 m along x, at 0.2 m/s, from t = 0.
+
+    ``start`` (3,) is its position; ``t`` (frames,) is the time of each frame, seconds.
+    """
     distance = -np.sign(start[0] or 1.0) * 0.4
     return _shifted(track, distance * np.clip(t * 0.2 / abs(distance), 0, 1))
 
 
 def _carried(track: int, displacement: F8, t: F8) -> Motion:
-    """Return the motion of an object carried by ``displacement`` (3,), 15 cm high, at 0.5 m/s."""
+    """Return the motion of an object that is carried by ``displacement`` (3,), metres.
+
+    It moves at 0.5 m/s from t = 0, and is lifted by up to 15 cm; ``t`` is as for `_pushed`.
+    """
     share = np.clip(t * 0.5 / max(float(np.linalg.norm(displacement)), 0.1), 0, 1)
     height = 0.6 * share * (1 - share)
     return Motion(track, np.round(np.outer(share, displacement) + np.outer(height, [0, 0, 1.0]), 6))

@@ -13,7 +13,7 @@ __all__ = ["Filming", "arc_orbit", "lateral_pass", "looking_at", "static_view"]
 
 
 class Filming(NamedTuple):
-    """Number of frames and frame rate."""
+    """Number of frames and frame rate of a camera path."""
 
     frames: int
     rate_hz: float
@@ -24,13 +24,13 @@ class Filming(NamedTuple):
 
 
 Range = float | tuple[float, float]
-"""A value, or a range from which it is drawn."""
+"""A value, or the range from which to draw it."""
 
 
 def looking_at(eye: F8, target: F8, *, roll: float = 0.0) -> Pose:
     """Return the pose of a camera at ``eye`` (3,) that looks at ``target`` (3,).
 
-    ``roll`` is in radians. Entries are rounded, so that the pose is the same on every machine.
+    ``roll`` is in radians. The pose is rounded, so that it is the same on every machine.
     """
     forward = np.asarray(target, np.float64) - eye
     forward /= np.linalg.norm(forward)
@@ -130,7 +130,7 @@ def _drawn(rng: Generator, value: Range) -> float:
 def static_view(
     rng: Generator, target: F8, frames: int, *, distance: float, elevation: float
 ) -> tuple[Pose, ...]:
-    """Return the same pose in all frames: a static camera, aimed at a target.
+    """Return the poses of a static camera that faces a target: the same one for all frames.
 
     Parameters
     ----------

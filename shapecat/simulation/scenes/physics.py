@@ -28,11 +28,11 @@ _CLEARANCE_M = 0.02
 _FALL_STEPS = 75
 """Simulation steps between two drops."""
 _MAX_STEPS = 750
-"""Simulation steps after the last drop, at most."""
+"""Maximum number of simulation steps after the last drop."""
 _STILL = 0.02
 """Speed, in m/s and rad/s, below which an object is at rest."""
 _CHECK_STEPS = 12
-"""Simulation steps between two checks whether everything is at rest."""
+"""Simulation steps between two checks that everything is at rest."""
 _WAITING_M = 5.0
 """Distance from the scene at which objects wait to be dropped."""
 
@@ -60,6 +60,8 @@ class SettledPose(NamedTuple):
 
 def settle(obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> list[SettledPose]:
     """Drop objects one by one from just above the others, and simulate until all are at rest.
+
+    The simulation ends at the latest `_MAX_STEPS` steps after the last drop.
 
     Parameters
     ----------
@@ -92,7 +94,7 @@ def settle(obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> list[SettledPose
 
 
 def _ignore_warning(_: str) -> None:
-    """Ignore warnings of an unstable simulation; objects that fly off are not on the support."""
+    """Ignore a warning of an unstable simulation; callers discard objects that fly off."""
 
 
 def _model(mujoco: Any, obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> Any:
@@ -126,10 +128,10 @@ def _extreme_points(mesh: Mesh) -> F8:
 
 
 def _start(drop: Drop, points: F8, placed_points: Sequence[F8]) -> Pose:
-    """Return the pose of a dropped object, slightly above everything at its position.
+    """Return the start pose of a dropped object, slightly above everything at its position.
 
-    ``points`` (n, 3) are its extreme vertices; ``placed_points`` are the vertices of the
-    other meshes, in the world frame.
+    ``points`` (n, 3) are its extreme vertices; ``placed_points`` are those of each other mesh, in
+    the world frame.
     """
     turned = points @ drop.rotation.T
     middle = (turned.min(axis=0) + turned.max(axis=0)) / 2
@@ -158,7 +160,7 @@ def _pose(data: Any, k: int) -> Pose:
 
 
 def _settled_poses(mujoco: Any, model: Any, data: Any, count: int) -> list[SettledPose]:
-    """Return the settled pose of each object; the largest upward force identifies its support."""
+    """Return the settled pose of each object; the largest upward force on it tells its support."""
     model.opt.enableflags = 0  # sleeping bodies have no contacts
     mujoco.mj_forward(model, data)
     upward_force = np.zeros((count, count + 1))  # the last column: obstacles

@@ -22,7 +22,7 @@ __all__ = ["KINDS", "Item", "bin_picking", "make_item", "pile", "settled", "shel
 KINDS = tuple(DISTRACTORS)
 """Kinds of objects outside the categories."""
 _UPRIGHT = 0.45
-"""Fraction of the objects dropped nearly upright; the others have any rotation."""
+"""Fraction of the objects that are dropped nearly upright; others get a random rotation."""
 _TILT_DEG = 8.0
 _UPRIGHT_COS, _LYING_COS = np.cos(np.radians(15)), np.sin(np.radians(15))
 _FALLEN_M = 0.02
@@ -32,7 +32,8 @@ _FALLEN_M = 0.02
 class Item(NamedTuple):
     """An object to drop.
 
-    A distractor has the ``category`` ``unknown`` and its own ``kind``; for others both are equal.
+    A distractor has the ``category`` ``unknown`` and its own ``kind``; for other objects, the two
+    are equal.
     """
 
     category: str
@@ -43,7 +44,9 @@ class Item(NamedTuple):
 def pile(
     rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
-    """Return a heap of objects dropped on a table, which lean on, lie across and lie in each other.
+    """Return a scene of objects dropped on a table.
+
+    The objects lean on each other, lie across each other, or lie in each other.
 
     Parameters
     ----------
@@ -74,7 +77,10 @@ def pile(
 def bin_picking(
     rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
-    """Return objects dropped into a bin, seen from above; parameters as for `pile`."""
+    """Return a scene of objects dropped into a bin, seen from above.
+
+    Objects that are too large for the bin are left out. The parameters are as for `pile`.
+    """
     bottom, sides = make_bin(rng)
     half = np.ptp(bottom.outline[:, :2], axis=0) / 2
     items = [make_item(category, rng, kinds) for category in categories]
@@ -90,9 +96,9 @@ def bin_picking(
 def shelf_bin(
     rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
-    """Return objects dropped into a shelf compartment, seen from the front.
+    """Return a scene of objects dropped into a shelf compartment, seen from the front.
 
-    The parameters are as for `pile`.
+    Objects that are too large for it are left out. The parameters are as for `pile`.
     """
     board, walls, top = make_compartment(rng)
     half = np.ptp(board.outline[:, :2], axis=0) / 2
@@ -115,7 +121,10 @@ def make_item(category: str, rng: Generator, kinds: Sequence[str]) -> Item:
 
 
 def _drops_within(rng: Generator, items: Sequence[Item], half: F8) -> list[Drop]:
-    """Return drops, in random rotations, onto an area of half size ``half`` (2,), metres."""
+    """Return drops of items with random rotations and positions.
+
+    ``half`` (2,) is half the length and width of the area that they fall on, metres.
+    """
     drops = []
     for item in items:
         room = np.maximum(half - float(item.mesh.extents.max()) / 2 - 0.01, 0)
@@ -142,15 +151,15 @@ def settled(
 ) -> tuple[PlacedObject, ...]:
     """Drop items onto supports; return the objects that come to rest on the support ``below``.
 
-    They are numbered from 0 in the order of ``items``. Objects that rise ``highest_m`` metres or
-    more above the surface of ``below`` are left out too, and so is everything that rests on them.
+    The objects are numbered from 0 in the order of ``items``. Objects that reach ``highest_m``
+    metres or more above the surface of ``below`` are left out, and so is all that rests on them.
     """
     settled_poses = settle([support.mesh for support in supports], drops)
     stays = [
         _rests_on(k.mesh, landed, below, highest_m)
         for k, landed in zip(items, settled_poses, strict=True)
     ]
-    for _ in stays:  # a support may come after what it carries
+    for _ in stays:  # an object may come before the one that carries it
         stays = [
             stay and (landed.supported_by is None or stays[landed.supported_by])
             for stay, landed in zip(stays, settled_poses, strict=True)

@@ -27,13 +27,13 @@ from shapecat.simulation.shapes.mesh import Mesh
 __all__ = ["room"]
 
 _DEVICES = {"laptop": make_laptop, "keyboard": make_keyboard, "plant": make_plant}
-"""Large objects on the table, outside the categories."""
+"""Functions that make large objects on the table, outside the categories, by name."""
 
 
 def room(
     rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
-    """Return objects on a table among background equipment; parameters as for `pile`."""
+    """Return a scene of a table with objects among equipment; the parameters are as for `pile`."""
     supports = [*make_room(rng, wall_chance=0.7), make_table(rng)]
     table = supports[-1]
     supports += _walls(rng)

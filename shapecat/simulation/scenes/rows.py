@@ -20,13 +20,13 @@ __all__ = ["rows"]
 
 _GAPS_M = (0.0005, 0.002, 0.005, 0.01, 0.02, 0.04)
 _SHIFT = 0.3
-"""Maximum shift of objects in groups that are not exact, as a fraction of the gap."""
+"""Maximum shift of the objects of an irregular group, as a fraction of the gap."""
 _MISSING = 0.15
-"""Fraction of the objects of the top layer that are missing in every second group."""
+"""In half of the groups, the probability that an object with nothing on top is missing."""
 _DIFFERENT = 0.3
-"""Probability that the objects of a row differ in size; they are not stacked."""
+"""Probability that a group is a single row of objects of different sizes."""
 _MOST_ALONG = (6, 5, 4)
-"""Maximum numbers of columns, lines and layers of a group."""
+"""Maximum number of objects of a group along its rows, across them, and in height."""
 _MOST = 120
 """Maximum number of objects of a scene."""
 _MARGIN_M = 0.01
@@ -41,7 +41,7 @@ class _Place(NamedTuple):
     """An object of a group.
 
     ``corner`` (3,) is the minimum corner of its bounding box in the group, metres; ``below`` is the
-    index of the object that it stands on, None on the support.
+    index of the object that it stands on, None if it stands on the support.
     """
 
     piece: Piece
@@ -51,11 +51,12 @@ class _Place(NamedTuple):
 
 
 def rows(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Return groups of similar objects on a table, on a shelf, or in a bin.
+    """Return a scene of groups of similar objects: on a table, on a shelf, or in a bin.
 
     Parameters
     ----------
-    categories : category of each group; groups without room are left out.
+    categories : category of each group. A table uses the first one to five, a bin the first; groups
+        for which there is no room are left out.
     filming : number of frames and frame rate.
     """
     groups = _Groups(rng)
@@ -84,7 +85,7 @@ def rows(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
 
 
 class _Groups:
-    """Groups of objects, put on supports one by one."""
+    """Groups of objects, which `put` places on supports one by one."""
 
     def __init__(self, rng: Generator) -> None:
         self.objects: list[PlacedObject] = []
@@ -92,7 +93,7 @@ class _Groups:
         self._outlines: list[tuple[Support, F8]] = []
 
     def put(self, category: str, support: Support, yaw: float, *, headroom_m: float) -> None:
-        """Put a group of a category on a support, if there is room.
+        """Place a random group of a category on a support, if there is room.
 
         Parameters
         ----------
@@ -131,7 +132,7 @@ class _Groups:
     def _add(
         self, group: Sequence[_Place], corner: F8, turn: Pose, support: Support, shift_m: float
     ) -> None:
-        """Add the objects of a group, without a few that nothing stands on."""
+        """Add the objects of a group; a few that carry nothing may be left out at random."""
         rng, missing = self._rng, _MISSING * self._rng.integers(2)
         carrying = {place.below for place in group}
         tracks: dict[int | None, int] = {}
@@ -148,9 +149,9 @@ class _Groups:
 
 
 def _draw_group(category: str, rng: Generator, gap: float, room: F8) -> list[_Place]:
-    """Draw the objects of a group, layer by layer; empty if one is larger than ``room``.
+    """Draw a group of objects; return them layer by layer, or none if one does not fit.
 
-    ``gap`` between objects and ``room`` (3,) are in metres.
+    ``gap`` is the distance between objects, ``room`` (3,) the maximum size of the group, metres.
     """
     piece = make_piece(category, rng)
     size = footprint(piece.mesh, piece.stable_pose.pose)
@@ -175,7 +176,8 @@ def _draw_row(
 ) -> list[_Place]:
     """Draw a row of objects of different sizes, aligned at the front, as books on a shelf.
 
-    ``gap`` and ``headroom_m`` are in metres; taller objects are left out.
+    ``gap`` is the distance between objects, metres. Objects taller than ``headroom_m`` are left
+    out.
     """
     row, along = [], 0.0
     for _ in range(count):

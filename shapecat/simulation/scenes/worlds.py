@@ -23,11 +23,11 @@ class Support(Record):
     Attributes
     ----------
     name : unique in its world.
-    label : pixel label, 1 to 9; unique among supports that hold objects, or the ground truth counts
-        their pixels together.
+    label : pixel label, 1 to 9. Supports that hold objects need different labels; otherwise, the
+        ground truth counts their pixels together.
     mesh : metres, world frame.
-    outline : (k, 3) corners of its horizontal surface, metres, world frame; none, the default,
-        if nothing can stand on it, as on a wall.
+    outline : (k, 3) corners of its horizontal surface, metres, world frame; empty, as by default,
+        if nothing can stand on it, as for a wall.
     """
 
     name: str
@@ -80,7 +80,7 @@ class PlacedObject(Record):
 
     @property
     def indistinct(self) -> bool:
-        """Whether its shape does not determine its category: an upside-down cup without handle."""
+        """Whether its shape also fits another category: an upside-down cup without a handle."""
         return self.category == "cup" and self.upside_down and not _one_sided(self.mesh)
 
 
@@ -104,6 +104,7 @@ class World(Record):
     Attributes
     ----------
     kind : name of the kind of scene.
+    supports, objects : the meshes of the scene; mesh ids number the supports first.
     path : ``world_from_camera`` for each of the t images, with the camera's optical axes.
     turns : (t,) rotation of all objects about the world's z axis in each frame, radians; None if
         they do not rotate.
@@ -122,7 +123,7 @@ class World(Record):
         return len(self.path)
 
     def pose_of(self, item: PlacedObject, frame: int) -> Pose:
-        """Return ``world_from_mesh`` of an object in a frame; its start pose if it is absent."""
+        """Return ``world_from_mesh`` of an object in a frame, or its first pose if it is absent."""
         shift = self._shifts.get(item.track)
         pose = item.pose
         if shift is not None and np.isfinite(shift[frame]).all():
@@ -136,7 +137,7 @@ class World(Record):
         return shift is None or bool(np.isfinite(shift[frame]).all())
 
     def geometry(self, frame: int) -> Geometry:
-        """Return the triangles in a frame, world coordinates; the supports come first."""
+        """Return the triangles in a frame, in world coordinates: supports first, then objects."""
         moves = self.motions or self.turns is not None
         return self._gather(frame) if moves else self._still
 
@@ -146,7 +147,7 @@ class World(Record):
 
     @cached_property
     def _labels(self) -> U1:
-        """(n + 1,) labels of the supports, then of the objects; the last means no mesh."""
+        """(n + 1,) labels of the supports, then of the objects; the last one, 0, is for no mesh."""
         labels = [s.label for s in self.supports] + [t.label for t in self.objects]
         return np.array([*labels, 0], np.uint8)
 
@@ -179,7 +180,7 @@ def pose_from_yaw(angle: float, place: ArrayLike = (0, 0, 0)) -> Pose:
 
 
 def _one_sided(mesh: Mesh) -> bool:
-    """Return whether a part, such as a handle, sticks out on one side of an upright mesh."""
+    """Return whether a part, such as a handle, sticks out from one side of a mesh."""
     points = np.asarray(mesh.vertices, np.float64)
     rim = points[points[:, 2] > points[:, 2].max() - 0.002, :2]
     angle = np.arange(64) * (2 * np.pi / 64)

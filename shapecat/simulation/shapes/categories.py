@@ -20,10 +20,10 @@ _MAKERS = {
 
 
 def make_object(category: str, rng: Generator) -> Mesh:
-    """Make a random object of one of `shapecat.types.CATEGORIES`, standing on the origin.
+    """Make a random object of one of `shapecat.types.CATEGORIES`; it stands on z = 0.
 
-    The shapes obey the definitions of the categories: the ratio of depth to diameter of cups, bowls
-    and plates, and the narrow neck of bottles.
+    The shapes obey the definitions of the categories: cups, bowls and plates differ in their ratio
+    of depth to diameter, and bottles have a narrow neck.
 
     Raises
     ------

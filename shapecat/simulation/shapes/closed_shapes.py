@@ -14,7 +14,7 @@ __all__ = ["make_ball", "make_bottle", "make_box", "make_can"]
 
 
 def make_can(rng: Generator) -> Mesh:
-    """Make a closed cylinder: a soda can, tin, jar, tube or drum."""
+    """Make a can: a closed cylinder, such as a soda can, tin, jar, tube or drum."""
     family = rng.choice(
         ["soda", "tin", "flat", "tube", "jar", "plain", "drum"],
         p=[0.2, 0.2, 0.16, 0.12, 0.1, 0.15, 0.07],
@@ -101,7 +101,7 @@ def _plain(rng: Generator, r: float, h: float) -> F8:
 
 
 def make_bottle(rng: Generator) -> Mesh:
-    """Make a closed body with a neck at most 0.62 times as wide as the body."""
+    """Make a bottle: a closed body with a neck at most 0.62 times as wide as the body."""
     family = rng.choice(
         ["water", "wine", "shampoo", "spray", "cleanser", "squeeze", "slim", "pump", "trigger"],
         p=[0.2, 0.13, 0.17, 0.1, 0.1, 0.1, 0.08, 0.06, 0.06],
@@ -144,7 +144,10 @@ def make_bottle(rng: Generator) -> Mesh:
 
 
 def _bottle_side(rng: Generator, family: str, body: float) -> F8:
-    """Return the side profile (radius, z) of a unit bottle, from its foot to its shoulder."""
+    """Return the profile (radius, z) of a bottle's body, from its foot to its shoulder.
+
+    The bottle has height 1 and radius 1; its body ends at z = ``body``.
+    """
     foot = rng.uniform(0.85, 0.98)
     waist = {"cleanser": rng.uniform(0.72, 1.0), "water": rng.uniform(0.84, 1.02)}.get(family, 1.0)
     top = {"squeeze": rng.uniform(0.75, 1.0), "shampoo": rng.uniform(0.8, 1.05)}.get(family, 1.0)
@@ -155,7 +158,11 @@ def _bottle_side(rng: Generator, family: str, body: float) -> F8:
 
 
 def _bottle(rng: Generator, side: F8, shoulder: float, neck: float, *, tip: bool) -> F8:
-    """Return the profile (radius, z) of a bottle of height 1 and radius 1."""
+    """Return the profile (radius, z) of a bottle of height 1 and radius 1.
+
+    ``side`` is the profile of its body, ``shoulder`` a height, ``neck`` a radius; ``tip`` narrows
+    the cap to a tip.
+    """
     start, width = side[-1, 1], side[-1, 0]
     t = np.linspace(0, 1, 9)[1:]
     shape = rng.choice(["round", "cone", "bell"])
@@ -175,7 +182,11 @@ def _bottle(rng: Generator, side: F8, shoulder: float, neck: float, *, tip: bool
 
 
 def _flattened(mesh: Mesh, stretch: float, low: float, high: float, neck: float) -> Mesh:
-    """Make the body oval but keep the neck round."""
+    """Make the body oval, but keep the neck round.
+
+    ``stretch`` is the body's width along y divided by that along x. The body ends at z = ``low``,
+    and the neck, of relative radius ``neck``, begins at ``high``.
+    """
     if stretch >= 1:
         return mesh
     points = np.asarray(mesh.vertices, np.float64)
@@ -188,7 +199,7 @@ def _flattened(mesh: Mesh, stretch: float, low: float, high: float, neck: float)
 
 
 def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
-    """Shift the neck to one side, as on a detergent bottle."""
+    """Shift the part above z = ``low`` to one side, as the neck of a detergent bottle."""
     points = np.array(mesh.vertices, np.float64)
     t = np.clip((points[:, 2] - low) / (high - low), 0, 1)
     points[:, 0] += shift * t * t * (3 - 2 * t)
@@ -253,7 +264,7 @@ def make_box(rng: Generator) -> Mesh:
 
 
 def _gable_carton(rng: Generator) -> Mesh:
-    """Return a milk carton with a roof."""
+    """Return a milk carton with a gable."""
     width, tall, roof = log_uniform(rng, 0.055, 0.1), rng.uniform(1.3, 2.2), rng.uniform(0.25, 0.45)
     high = (tall + roof) * width
     outline = [

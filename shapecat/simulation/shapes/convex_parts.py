@@ -13,17 +13,17 @@ __all__ = ["convex_parts", "hollowness"]
 _PITCH_M = 0.004
 """Distance between samples of a surface."""
 _BLOCKS = 4
-"""Blocks along each axis that a hollow mesh is cut into; a wall is nearly flat within a block."""
+"""Number of blocks along each axis of a hollow mesh; a wall is nearly flat within a block."""
 _SKIN_M = 0.001
 """Half the minimum thickness of a part: physics engines reject solids without volume."""
 _HOLLOW = 0.2
-"""Hollowness from which a mesh is cut into blocks."""
+"""Minimum hollowness of a mesh that is cut into blocks."""
 _COLUMNS = 9
-"""Columns along x and y in which the hollowness is measured."""
+"""Number of columns along x and along y in which the hollowness is measured."""
 
 
 def convex_parts(mesh: Mesh) -> list[F8]:
-    """Return the corners (k, 3) of each convex solid of a mesh, metres, in the mesh's frame.
+    """Decompose a mesh into convex solids; return the corners (k, 3) of each, in metres.
 
     A mesh without an opening at its top becomes one solid, its convex hull. The walls of an open
     mesh are cut into blocks, so that an object can fall into a cup.
@@ -64,7 +64,7 @@ def _span(hull: ConvexHull, positions: F8) -> tuple[F8, F8]:
 
 
 def _samples(mesh: Mesh) -> F8:
-    """Return points (n, 3) over the whole surface, about `_PITCH_M` apart or closer."""
+    """Return sample points (n, 3) of the whole surface, at most about `_PITCH_M` apart."""
     corners = np.asarray(mesh.vertices, np.float64)[mesh.triangles]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     counts = np.ceil(longest / _PITCH_M).astype(int).clip(1, 100)
@@ -101,7 +101,7 @@ def _thickened(points: F8) -> F8:
 
 
 def _corners(points: F8, directions: F8) -> F8:
-    """Return the points (k, 3) farthest along any of the directions: a hull with few corners."""
+    """Return the point that is farthest along each direction, without duplicates: (k, 3)."""
     return np.asarray(points[np.unique((points @ directions.T).argmax(axis=0))])
 
 
@@ -115,4 +115,4 @@ def _sphere(count: int) -> F8:
 
 _AXES = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1]), -1).reshape(-1, 3).astype(float)
 _ALL_AROUND = np.concatenate([_AXES, _sphere(100)])
-"""Directions for a convex hull; with `_AXES` among them, the hull of a box keeps its corners."""
+"""Directions in which to look for the corners of a hull; `_AXES` keep the corners of boxes."""

@@ -1,4 +1,4 @@
-"""Objects outside the seven categories, which train and test the rejection of unknown shapes."""
+"""Distractors: objects outside the seven categories, which a model must call *unknown*."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ from shapecat.simulation.shapes.toys import TOYS
 __all__ = ["DISTRACTORS", "make_distractor"]
 
 DISTRACTORS: dict[str, Callable[[Generator], Mesh]] = {**KITCHEN, **TOOLS, **TOYS}
-"""The function that makes each kind of object outside the categories."""
+"""The function that makes a random object of each kind outside the categories."""
 
 
 def make_distractor(rng: Generator, kind: str | None = None) -> tuple[str, Mesh]:

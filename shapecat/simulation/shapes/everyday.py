@@ -92,7 +92,7 @@ _GADGET = ((0.05, 0.2), (0.03, 0.12), (0.012, 0.07))
 
 
 def _power_tool(rng: Generator) -> Mesh:
-    """Return a barrel with a grip, some with a foot: a drill, pistol, hair dryer or pliers."""
+    """Return a barrel with a grip and sometimes a foot: a drill, pistol, hair dryer or pliers."""
     long, thick = log_uniform(rng, 0.09, 0.22), log_uniform(rng, 0.012, 0.03)
     path = long * np.array([[0, 0, 0], [0.5, 0, 0], [1, 0, rng.uniform(-0.1, 0.1)]])
     width = thick * np.interp(np.linspace(0, 1, 12), [0, 0.3, 0.7, 1], rng.uniform(0.5, 1.2, 4))
@@ -141,7 +141,7 @@ def _fixture(rng: Generator) -> Mesh:
 
 
 def _any_side(mesh: Mesh, rng: Generator) -> Mesh:
-    """Return a mesh that rests on one of its sides."""
+    """Turn a mesh so that it stands on a side chosen at random."""
     about, degrees = str(rng.choice(["x", "y"])), float(rng.choice([0, 0, 90, 180]))
     return standing(placed(mesh, about=about, degrees=degrees))
 
@@ -155,4 +155,4 @@ EVERYDAY: dict[str, Callable[[Generator], Mesh]] = {
     "vehicle": _vehicle,
     "fixture": _fixture,
 }
-"""The function that makes each family of objects."""
+"""The function that makes a random object of each family."""

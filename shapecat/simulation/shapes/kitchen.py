@@ -197,4 +197,4 @@ KITCHEN: dict[str, Callable[[Generator], Mesh]] = {
     "pear": _pear,
     "mushroom": _mushroom,
 }
-"""The function that makes each kind of object."""
+"""The function that makes a random object of each kind."""

@@ -14,7 +14,7 @@ __all__ = ["Mesh", "join", "moved", "scaled", "standing"]
 class Mesh(Record):
     """A triangle mesh; the winding order of its triangles does not matter.
 
-    Coordinates are rounded to 1 um, so that sines, whose last bit differs between machines, do not
+    Coordinates are rounded to 1 um: the last bit of a sine differs between machines, and must not
     change a simulated recording.
 
     Attributes
@@ -48,7 +48,7 @@ def join(parts: Sequence[Mesh]) -> Mesh:
 
 
 def scaled(mesh: Mesh, factors: ArrayLike) -> Mesh:
-    """Scale a mesh by one factor, or by a factor for each axis (3,)."""
+    """Scale a mesh by one factor, or by one factor per axis (3,)."""
     return Mesh(mesh.vertices * np.asarray(factors, np.float64), mesh.triangles)
 
 

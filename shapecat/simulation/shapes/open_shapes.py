@@ -15,7 +15,7 @@ __all__ = ["make_bowl", "make_cup", "make_plate"]
 
 
 def make_cup(rng: Generator) -> Mesh:
-    """Make a mug, glass, beaker or teacup, deeper than 0.65 of its diameter."""
+    """Make a cup: a mug, glass, beaker or teacup, deeper than 0.65 times its diameter."""
     family = rng.choice(
         ["mug", "glass", "beaker", "teacup", "barrel", "espresso"],
         p=[0.34, 0.2, 0.1, 0.14, 0.14, 0.08],
@@ -55,7 +55,7 @@ def make_cup(rng: Generator) -> Mesh:
 
 
 def make_bowl(rng: Generator) -> Mesh:
-    """Make a bowl, ramekin or basin, 0.2 to 0.65 of its diameter deep."""
+    """Make a bowl, ramekin or basin, with a depth of 0.2 to 0.65 times its diameter."""
     family = rng.choice(
         ["round", "cone", "flared", "straight", "tulip"], p=[0.38, 0.2, 0.17, 0.15, 0.1]
     )
@@ -88,7 +88,7 @@ def make_bowl(rng: Generator) -> Mesh:
 
 
 def make_plate(rng: Generator) -> Mesh:
-    """Make a plate, saucer or shallow dish, at most 0.2 of its diameter deep."""
+    """Make a plate, saucer or shallow dish, with a depth of at most 0.2 times its diameter."""
     family = rng.choice(["rimmed", "coupe", "flat", "deep"], p=[0.4, 0.22, 0.2, 0.18])
     diameter = log_uniform(rng, 0.11, 0.34)
     ratio = {
@@ -121,9 +121,10 @@ def make_plate(rng: Generator) -> Mesh:
 
 
 def _wall(shares: ArrayLike, radius: float, height: float, *, power: float) -> F8:
-    """Return the outer profile (radius, z) from bottom to top.
+    """Return the outer profile (radius, z) of a vessel from bottom to top.
 
-    ``shares`` (k,) are radii relative to the largest one, which is ``radius``.
+    ``shares`` (k,) are radii relative to the largest one, which is ``radius``. They are evenly
+    spaced in height for a ``power`` of 1, and closer to the bottom for a larger one.
     """
     shares = np.asarray(shares, np.float64)
     heights = np.linspace(0, 1, len(shares)) ** power
@@ -138,7 +139,10 @@ def _wall(shares: ArrayLike, radius: float, height: float, *, power: float) -> F
 
 
 def _foot(rng: Generator, chance: float, tallest: float) -> tuple[float, float]:
-    """Return the radius of a foot ring, relative to the bottom's radius, and its height, metres."""
+    """Draw a foot ring: its radius relative to the bottom's radius, and its height in metres.
+
+    With probability 1 - ``chance`` there is none, and the height is 0.
+    """
     if rng.random() >= chance:
         return 1.0, 0.0
     return rng.uniform(0.7, 0.95), rng.uniform(0.3, 1.0) * tallest
@@ -149,7 +153,8 @@ def _hollow(
 ) -> F8:
     """Return the closed profile (radius, z) of a vessel: foot, outside, rim, inside.
 
-    ``wall`` and ``floor`` are thicknesses, and ``lip`` the width of a flared rim, in metres.
+    ``outer`` is from `_wall` and ``foot`` from `_foot`. ``wall`` and ``floor`` are thicknesses,
+    ``lip`` is the width of a flared rim, all in metres.
     """
     share, tall = foot
     bottom = outer[0, 0]
@@ -174,9 +179,10 @@ def _hollow(
 
 
 def _section(rng: Generator, *, oval: float, square: float, facets: float) -> dict[str, Any]:
-    """Draw a cross-section for `lathe`: mostly round, else oval, a rounded square or a polygon.
+    """Draw a cross-section, as keyword arguments of `lathe`: mostly round.
 
-    ``oval``, ``square`` and ``facets`` are the probabilities of these.
+    ``oval``, ``square`` and ``facets`` are the probabilities of an oval, a rounded square and a
+    polygon.
     """
     kind = rng.random()
     if kind < oval:
@@ -189,7 +195,10 @@ def _section(rng: Generator, *, oval: float, square: float, facets: float) -> di
 
 
 def _handle_shape(rng: Generator, diameter: float, height: float) -> tuple[F8, float, float]:
-    """Draw a handle: its curve (k, 2) outward and up from mid-wall, its radius and flatness."""
+    """Draw a handle: its curve (k, 2), its radius and its flatness.
+
+    The curve is outward from the wall and upward from half its height, metres.
+    """
     tall = height * rng.uniform(0.25, 0.4)
     depth = diameter * rng.uniform(0.2, 0.42)
     curves = (

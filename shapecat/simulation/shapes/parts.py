@@ -16,7 +16,10 @@ __all__ = ["ellipsoid", "placed", "rod", "turned_body"]
 def placed(
     mesh: Mesh, place: ArrayLike = (0, 0, 0), *, about: str = "", degrees: float = 0.0
 ) -> Mesh:
-    """Turn a mesh about the axis ``x``, ``y`` or ``z``, then move it by ``place`` (3,), metres."""
+    """Turn a mesh by ``degrees``, then move it by ``place`` (3,), in metres.
+
+    ``about`` is the axis of the turn: ``x``, ``y`` or ``z``.
+    """
     half = np.radians(degrees) / 2
     quaternion = [0.0, 0.0, 0.0, float(np.cos(half))]
     if about:

@@ -16,7 +16,7 @@ Points: TypeAlias = F8 | Sequence[Sequence[float]]
 
 
 def _grid(rows: int, columns: int, *, closed: bool) -> I4:
-    """Return the triangles (m, 3) between rows of ``columns`` vertices; closed rows are rings."""
+    """Return the triangles (m, 3) of a grid of vertices; if ``closed``, each row is a ring."""
     row = np.arange(rows - 1)[:, None] * columns
     column = np.arange(columns if closed else columns - 1)[None]
     after = (column + 1) % columns
@@ -37,8 +37,8 @@ def lathe(
 
     Parameters
     ----------
-    profile : (k, 2) radius and z, metres, along the surface from the centre of the bottom.
-    segments : number of corners of the cross-section; few make a polygon.
+    profile : (k, 2) radius and z, metres, along the surface.
+    segments : number of corners of the cross-section.
     stretch : size of the cross-section along y divided by that along x.
     squareness : exponent of the superellipse: 2 is round, 6 a square with rounded corners.
     turn : angle of the first corner, radians.
@@ -69,9 +69,9 @@ def tube(
     Parameters
     ----------
     path : (k, 3) metres.
-    radius : in the plane of the path, metres: a number, or (k,) one per point.
+    radius : radius in the plane of the path, metres: a number, or one per point (k,).
     segments : number of corners of the cross-section.
-    flatness : radius across the plane of the path divided by that in the plane.
+    flatness : radius perpendicular to the plane of the path, divided by the radius in the plane.
     closed : whether the path is a ring; if not, the ends are capped.
     """
     path = np.asarray(path, np.float64)
@@ -138,7 +138,7 @@ def rounded_box(size: ArrayLike, *, radius: float = 0.0, bulge: float = 0.0, fin
     Parameters
     ----------
     size : (3,) metres.
-    radius : radius of the edges, metres; at most 0.45 of half the smallest size.
+    radius : radius of the edges, metres; limited to 0.45 times half the smallest size.
     bulge : outward displacement of the middle of each side face, metres.
     fine : number of mesh cells along the flat part of a face.
     """
@@ -174,13 +174,13 @@ def _box_lines(half: float, radius: float, fine: int) -> F8:
     if radius <= 0:
         return flat
     turn = radius * (1 - np.tan(np.pi / 4 * np.array([1.0, 0.66, 0.33])))
-    # Projected onto the arc from its centre, these points of the square edge are at equal angles.
+    # These points on the square edge, seen from the centre of the arc, are at equal angles.
     edge = np.sort(radius - turn)[::-1]
     return np.concatenate([-(half - radius) - edge, flat, (half - radius + edge)[::-1]])
 
 
 def extrude(outline: Points, height: float) -> Mesh:
-    """Extrude a flat outline, star-shaped about its mean, from z = 0 to ``height``.
+    """Extrude a flat outline from z = 0 to ``height``; it must be star-shaped about its mean.
 
     Parameters
     ----------

@@ -107,7 +107,7 @@ def _branched(rng: Generator) -> Mesh:
 
 
 def _frame(rng: Generator) -> Mesh:
-    """Return a distorted ring with up to two rods across: glasses, a handle, wire or tape."""
+    """Return a distorted ring, crossed by up to two rods: glasses, a handle, wire or tape."""
     t = np.arange(40) * (2 * np.pi / 40)
     radius = log_uniform(rng, 0.03, 0.09) * (
         1 + rng.uniform(0, 0.4) * np.cos(int(rng.integers(2, 5)) * t + rng.uniform(0, 6))
@@ -133,4 +133,4 @@ PROCEDURAL: dict[str, Callable[[Generator], Mesh]] = {
     "frame": _frame,
     **EVERYDAY,
 }
-"""The function that makes each family of objects."""
+"""The function that makes a random object of each family."""

@@ -26,7 +26,7 @@ _AXES = np.array(
     ],
     np.float64,
 )
-"""Rotations that turn +z, -z, +x, -x, +y, -y of the file to +z."""
+"""Rotations that turn the axes +z, -z, +x, -x, +y and -y of the file to +z, in this order."""
 
 
 def load_mesh(path: Path) -> Mesh:
@@ -51,11 +51,12 @@ def load_mesh(path: Path) -> Mesh:
 
 
 def uprighted(mesh: Mesh, category: str) -> Mesh:
-    """Turn a mesh of a category upright, estimating which of its six axis directions is up.
+    """Turn a mesh upright; its category tells which of the six axis directions is up.
 
-    A can stands on the axis along which its outline is roundest; a bottle also prefers its longest
-    axis, with its narrow end up. A cup, bowl or plate is turned so that its surface, seen from
-    above, lies deepest below its top. A box or a ball keeps the axes of the file.
+    The axis of a can is the one along which its outline looks roundest. The axis of a bottle is
+    preferably long, too, and its narrow end is up. A cup, bowl or plate is turned so that its
+    inside, seen from above, lies as deep as possible below its top. A box or a ball keeps the axes
+    of the file.
     """
     points = np.asarray(mesh.vertices, np.float64)
     points = points - (points.min(axis=0) + points.max(axis=0)) / 2
@@ -77,7 +78,7 @@ def uprighted(mesh: Mesh, category: str) -> Mesh:
 
 
 def _roundness(points: F8) -> float:
-    """Return the smallest width of the outline seen along z divided by the largest."""
+    """Return the smallest width of the outline, seen along z, divided by the largest width."""
     angle = np.arange(16) * (np.pi / 16)
     flat = points[:, :2] @ [np.cos(angle), np.sin(angle)]
     widths = np.ptp(flat, axis=0)
@@ -85,7 +86,7 @@ def _roundness(points: F8) -> float:
 
 
 def _narrow_end(points: F8, triangles: I4) -> float:
-    """Return a positive number if the cross-sections of the upper half are the smaller ones."""
+    """Return a positive number if the upper half is narrower than the lower half, else <= 0."""
     low, high = points[:, 2].min(), points[:, 2].max()
     levels = np.linspace(low, high, 18)[1:-1]
     areas = [_slice_area(points[triangles], float(z)) for z in levels]
@@ -93,7 +94,7 @@ def _narrow_end(points: F8, triangles: I4) -> float:
 
 
 def _slice_area(corners: F8, z: float) -> float:
-    """Return the area of the convex hull of the horizontal section of triangles (m, 3, 3)."""
+    """Return the area, within its convex hull, of the section of triangles (m, 3, 3) at ``z``."""
     a, b = corners, np.roll(corners, -1, axis=1)
     cut = (a[..., 2] < z) != (b[..., 2] < z)
     a, b = a[cut], b[cut]
@@ -104,9 +105,9 @@ def _slice_area(corners: F8, z: float) -> float:
 
 
 def _hollow(points: F8, mesh: Mesh) -> float:
-    """Return the median depth, below the top, of the central surface as seen from above.
+    """Return how deep the central surface, seen from above, lies below the top.
 
-    The depth is relative to the largest distance from the z axis.
+    The depth is a median over the pixels, divided by the largest absolute x or y.
     """
     turned = Mesh(points, mesh.triangles)
     distance = 40 * float(np.abs(points).max())

@@ -20,7 +20,7 @@ class StablePose(Record):
 
     Attributes
     ----------
-    pose : ``level_from_mesh``: the lowest point at z = 0, the centre of mass over the origin.
+    pose : ``level_from_mesh``; the lowest point is at z = 0, the centre of mass above the origin.
     name : ``upright``, ``upside_down`` or ``lying``.
     """
 
@@ -31,8 +31,8 @@ class StablePose(Record):
 def stable_poses(mesh: Mesh) -> tuple[StablePose, ...]:
     """Return the stable poses of a mesh on a horizontal surface.
 
-    A mesh rests on a face of its convex hull if the hull's centre of mass lies above this face. It
-    is upright or upside down if its z axis is within 15 degrees of the vertical.
+    A mesh rests on a face of its convex hull if the hull's centre of mass lies above this face. A
+    pose is upright or upside down if the mesh's z axis is within 15 degrees of the vertical.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def _centre_of_mass(corners: F8, origin: F8) -> F8:
 
 
 def _inside(corners: F8, normals: F8, foot: F8) -> F8:
-    """Return whether each point lies in its triangle, (k,), with a tolerance of 1e-9."""
+    """Return whether each point of ``foot`` (k, 3) lies in its triangle, with a small tolerance."""
     signs = []
     for k in range(3):
         a, b = corners[:, k], corners[:, (k + 1) % 3]

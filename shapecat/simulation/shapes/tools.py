@@ -148,4 +148,4 @@ TOOLS: dict[str, Callable[[Generator], Mesh]] = {
     "spool": _spool,
     "shoe": _shoe,
 }
-"""The function that makes each kind of object."""
+"""The function that makes a random object of each kind."""

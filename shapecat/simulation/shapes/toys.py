@@ -136,4 +136,4 @@ TOYS: dict[str, Callable[[Generator], Mesh]] = {
     "plush": _plush,
     "blob": _blob,
 }
-"""The function that makes each kind of object."""
+"""The function that makes a random object of each kind."""
