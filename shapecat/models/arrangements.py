@@ -32,7 +32,7 @@ _RESTING_POSES = {
 }
 _ROUND = {"cup", "can", "bottle"}
 _RESIZED = 0.3
-"""Fraction of the tables on which all objects are scaled by one factor in the range `_SIZES`."""
+"""Fraction of the tables on which one factor, in the range `_SIZES`, scales all objects."""
 _SIZES = (0.55, 1.5)
 
 
@@ -96,14 +96,14 @@ class Arrangement(NamedTuple):
 
 
 BARE_TABLE = moved(rounded_box(_TABLE_M), Pose(np.eye(3), np.array([0.0, 0.0, -_TABLE_M[2]])))
-"""A table outside any room."""
+"""A table top with nothing around it."""
 _SETTLED: tuple[tuple[Callable[..., World], float, Arrangement], ...] = (
     (pile, 0.5, Arrangement([], (), (8.0, 90.0))),
     (bin_picking, 0.15, Arrangement([], (), (50.0, 90.0))),
     (shelf_bin, 0.15, Arrangement([], (), (5.0, 35.0), (-120.0, -60.0))),
     (room, 0.2, Arrangement([], (), (8.0, 80.0))),
 )
-"""Physics scenes with their probabilities and viewpoints."""
+"""Scenes arranged by physics, with their probabilities and their ranges of viewpoints."""
 
 
 def arrange(options: ArrangementOptions, rng: np.random.Generator) -> Arrangement:
@@ -172,7 +172,10 @@ def _make(options: ArrangementOptions, rng: np.random.Generator, size: float) ->
 def _at_rest(
     mesh: Mesh, label: str, options: ArrangementOptions, rng: np.random.Generator
 ) -> ArrangedObject:
-    """Draw a usual resting pose of the label; upright if the mesh has no such stable pose."""
+    """Put a mesh into a random resting pose; upright if it has no stable pose of that kind.
+
+    ``label`` is its category, which determines the probabilities.
+    """
     chances = dict(_RESTING_POSES.get(label, {"upright": 1.0}))
     if options.lying is not None and label in _ROUND:
         chances["upright"] += chances["lying"] - options.lying
@@ -197,7 +200,10 @@ def _tilted(item: ArrangedObject, rng: np.random.Generator) -> ArrangedObject:
 def placed(
     item: ArrangedObject, spot: tuple[float, float], support_m: float, rng: np.random.Generator
 ) -> ArrangedObject:
-    """Turn an object randomly about z and place it at ``spot`` (x, y) and height, in metres."""
+    """Turn an object randomly about z and place it at ``spot`` (x, y), on a support, in metres.
+
+    ``support_m`` is the height of the support.
+    """
     pose = pose_from_yaw(rng.uniform(0, 2 * np.pi), [*spot, support_m])
     return item._replace(mesh=moved(item.mesh, pose), support_m=support_m)
 
@@ -205,7 +211,7 @@ def placed(
 def _free_spot(
     spots: Sequence[tuple[float, float, float]], radius: float, rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """Return a free position (x, y) near the middle of the table; None if there is none.
+    """Return a free position (x, y) near the middle of the table; None if it finds none.
 
     ``spots`` holds the (x, y, radius) of the objects placed so far, in metres.
     """

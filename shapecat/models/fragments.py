@@ -11,9 +11,9 @@ __all__ = ["cut_fragment", "image_plane_points", "remove_base"]
 
 _FEWEST_POINTS = 60
 _KEPT = (0.3, 0.85)
-"""Minimum and maximum fraction of the points that stay visible."""
+"""Minimum and maximum fraction of the points that remain."""
 _LOW = 0.3
-"""A fragment contains points in this lowest fraction of the height, near the support."""
+"""A fragment contains points within this lowest fraction of the height, near the support."""
 _TRIES = 8
 
 
@@ -22,7 +22,7 @@ def cut_fragment(view: View, rng: np.random.Generator) -> View | None:
 
     Returns
     -------
-    A view with 30 to 85 % of the points, at least 60, some of them near the support; None after
+    A view with 30 to 85 % of the points: at least 60, some of them near the support. None after
     eight failed attempts.
     """
     across = image_plane_points(view)
@@ -53,7 +53,7 @@ def remove_base(view: View, rng: np.random.Generator) -> View:
 
 
 def image_plane_points(view: View) -> F8:
-    """Return the points of a view, (n, 2) metres, on a plane across the line of sight."""
+    """Project the points of a view onto a plane across the line of sight; (n, 2), metres."""
     centre = view.points.mean(axis=0, dtype=np.float64)
     sight = view.eye - centre
     sight /= np.linalg.norm(sight)

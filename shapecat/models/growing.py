@@ -52,8 +52,8 @@ def collect_chunks(
 ) -> list[_T]:
     """Collect samples from series of scenes in spawned processes, and show the progress.
 
-    A series has a ``first`` seed and a number of ``scenes``; each call gets a chunk of at most
-    ``size`` scenes. The results are in order.
+    A series has a ``first`` seed and a number of ``scenes``. Each call of ``collect`` gets a part
+    of a series, of at most ``size`` scenes. The results are in the order of the series.
     """
     chunks = [
         one._replace(first=one.first + k, scenes=min(size, one.scenes - k))
@@ -70,7 +70,7 @@ def collect_chunks(
 def grow(features: F4, truth: Bool, growth: Growth, seed: int) -> BoostedTrees:
     """Grow trees by gradient boosting with the cross-entropy loss.
 
-    The first tree is a single leaf, the log odds of the class.
+    The first tree is a single leaf: the log odds of the positive class.
 
     Parameters
     ----------
@@ -96,6 +96,6 @@ def grow(features: F4, truth: Bool, growth: Growth, seed: int) -> BoostedTrees:
 
 
 def _leaf(value: float) -> Tree:
-    """Return a tree of one leaf, which adds a constant."""
+    """Return a tree of one leaf, which adds a constant to all scores."""
     none = np.zeros(1, np.int64)
     return Tree(none, np.zeros(1, np.float32), none, np.array([value], np.float32))

@@ -25,7 +25,7 @@ def mesh_views(
     ----------
     placements : number of rounds. In each, a mesh is placed 3 times upright and 2 times lying;
         balls, bowls and plates are always upright.
-    cameras : images of each placement; their views share an instance name.
+    cameras : number of images of each placement; their views share an instance name.
 
     Raises
     ------

@@ -36,7 +36,7 @@ __all__ = ["evaluate_model"]
 
 _TRACK_SEED, _TRACK_TABLES = 100_006, 24
 _DRAWN = 20
-"""Number of test arrangements among which to find the worst mistakes."""
+"""Number of test arrangements in which to look for the worst mistakes."""
 _HEAD = ("", "views", "accuracy", "balanced", "ECE", "known rejected", "unknown rejected", "AUROC")
 _text = partial(figure_text, missing="")
 
@@ -55,7 +55,7 @@ def evaluate_model(
 
     Parameters
     ----------
-    sets : the sets named in `SETS`.
+    sets : the views of each set in `SETS`, by name.
     meshes : folder of meshes to evaluate on, if any.
     recorded : folders of labelled recordings to evaluate on.
 
@@ -106,7 +106,7 @@ def _test_views() -> list[SimulatedView]:
 
 
 def _parts(views: SimulatedViews, model: Categorizer) -> list[tuple[str, Report]]:
-    """Return a report for each subset of the views; the subsets differ in difficulty."""
+    """Return the names and reports of subsets of the views, which differ in difficulty."""
     background = views.source == "background"
     whole = (views.source != "fragment") & ~background
     clear = clear_views(views)
@@ -166,7 +166,7 @@ def _tracks(jobs: int) -> Iterable[SimulatedView]:
 
 
 def _fused_table(tracks: dict[str, SimulatedViews], model: Categorizer) -> Table:
-    """Return a table of the accuracy of several fused views of one placement of an object."""
+    """Return a table of the accuracy after fusing several views of one placement of an object."""
     rows = []
     for name, views in tracks.items():
         report = evaluate(views.where(clear_views(views)).views, model)

@@ -1,7 +1,7 @@
 """Segments for training, split where a narrow neck joins two wider parts.
 
-The trees that merge segments learn from more and smaller segments than detection has, above all
-from pairs of similar objects that touch.
+The trees that merge segments thus learn from more and smaller segments than detection produces,
+above all from pairs of similar objects that touch.
 """
 
 import numpy as np
@@ -15,23 +15,23 @@ from shapecat.jit import kernel, unset
 __all__ = ["split_necks"]
 
 SIDE, DIAGONAL = 3, 4
-"""Chamfer distances to the neighbours of a cell: three units are one cell."""
+"""Chamfer distances from a cell to its neighbours, in thirds of a cell."""
 NECK = 1.7
-"""Minimum width of the narrower of two parts, relative to the neck between them, where a surface is
-split."""
+"""A surface is split at a neck if both of its sides are at least this many times as wide."""
 
 
 @kernel
 def split_necks(graph: SurfaceGraph, labels: I4, n: int) -> int:
-    """Split labels where they are much narrower than on either side; return their number.
+    """Split labelled regions at narrow necks; return the new number of labels.
 
     Two round objects that touch share a narrow bridge, in which the concave edge between them ends.
-    Cells are visited by their distance from the border, the innermost first: each starts a basin or
-    joins the basins beside it, unless both are much wider than the place where they meet.
+    Cells are visited by their distance from the border, the innermost first. A cell with no visited
+    neighbour starts a basin; any other joins a basin beside it. Where two basins meet, they are
+    merged, unless both are large, and much wider than the region is there.
 
     Parameters
     ----------
-    labels : (rows, columns) 1..n, 0 elsewhere, changed in place.
+    labels : (rows, columns) 1..n, 0 elsewhere; changed in place.
     n : number of labels.
 
     Source: Meyer 1991 (watershed of the distance transform).
@@ -74,7 +74,7 @@ def split_necks(graph: SurfaceGraph, labels: I4, n: int) -> int:
 
 @kernel
 def _distances(links: U1, spans: I4, labels: I4) -> tuple[I4, int]:
-    """Return the distance of each labelled cell to the border of its label, and the cell count.
+    """Return the distance of each labelled cell from the border of its label, and the cell count.
 
     The distances (rows, columns) are uninitialised elsewhere.
     """
@@ -115,7 +115,7 @@ def _distances(links: U1, spans: I4, labels: I4) -> tuple[I4, int]:
 
 @kernel
 def _inner_first(depth: I4, labels: I4, spans: I4, columns: int, count: int) -> I4:
-    """Return the labelled cells (count,) by decreasing distance from the border."""
+    """Return the flat indices (count,) of the labelled cells, farthest from the border first."""
     deepest = 0
     for i in range(len(spans)):
         for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
@@ -147,7 +147,10 @@ def _root(parent: I4, basin: int) -> int:
 
 @kernel
 def _number(cells: I4, basin: I4, parent: I4, size: I4, last: int, labels: I4, n: int) -> int:
-    """Label the basins: the largest of each label keeps it, the others get new ones."""
+    """Label the basins, and return the number of labels.
+
+    The largest basin of each label keeps the label; the others get new ones.
+    """
     label, largest = unset(last + 1, np.int16), np.zeros(n + 1, np.int32)
     for p in cells:
         root = _root(parent, basin[p])

@@ -1,7 +1,7 @@
 """Grow the trees that decide which segments to merge: ``python -m shapecat.models.parts``.
 
 Simulated scenes, seen by all sensors, give pairs of segments. The segments of each object are
-merged in random order, and the trees learn from all pairs on the way, so that they also know
+merged in random order. The trees learn from all pairs that occur on the way, so that they also know
 partially merged segments.
 """
 
@@ -56,7 +56,7 @@ class Series(NamedTuple):
     Attributes
     ----------
     first, scenes : the first seed and the number of scenes.
-    categories : of the objects.
+    categories : categories of the objects.
     split : whether the seeds of the watershed are split at necks.
     """
 
@@ -81,10 +81,11 @@ _SERIES = (
     Series("shelf_bin", 94_000, 300),
 )
 """Seeds below 2000 are for development, seeds from 100000 on for evaluation only. In piles and
-bins, objects lean, lie across each other and touch walls; in rows, like objects nearly touch. Split
-seeds show more pairs of like objects; with them in all scenes, stacks of cans were merged."""
+bins, objects lean, lie across each other and touch walls; in rows, similar objects nearly touch.
+Split seeds give more pairs of similar objects; in all scenes, they made the trees merge stacked
+cans."""
 _VIEWS = 4
-"""Views of each scene: from its path and from anywhere in turn, with one sensor after the other."""
+"""Number of views of each scene, alternately from its path and from anywhere; sensors vary."""
 _OTHERS = (
     *(sensor for sensor in PRESETS.values() if sensor not in (KINECT, REALSENSE)),
     IDEAL,
@@ -97,7 +98,7 @@ _SENSORS = tuple(chain.from_iterable(zip(cycle((KINECT, REALSENSE)), _OTHERS, st
 class Pairs(NamedTuple):
     """Pairs of segments.
 
-    ``features`` (n, `FEATURES`); ``same`` (n,), whether both segments are of one object.
+    ``features`` (n, `FEATURES`); ``same`` (n,), whether both segments show the same object.
     """
 
     features: F4
@@ -114,7 +115,7 @@ def main(*, seed: int, jobs: int, out: Path) -> None:
 
 
 def collect(scenes: Sequence[Series], jobs: int) -> Pairs:
-    """Return the pairs of segments of the scenes, whatever the number of jobs."""
+    """Return the pairs of segments of all scenes; the number of jobs does not affect the result."""
     both = collect_chunks(_collect, scenes, _CHUNK, jobs)
     return Pairs(np.concatenate([p.features for p in both]), np.concatenate([p.same for p in both]))
 
@@ -145,7 +146,7 @@ def _pairs(
     object_labels: I4,
     rng: np.random.Generator,
 ) -> Iterator[tuple[F4, bool]]:
-    """Yield the features of pairs of segments, single or merged, and whether they are one object.
+    """Yield the features of pairs of segments, single or merged, and whether both show one object.
 
     Parameters
     ----------
@@ -156,7 +157,7 @@ def _pairs(
     if model is None:
         return
     graph, labels, segments = oversegment(grid, model, split_seeds=split_seeds)
-    # Pairs that this rule merges are not left to the trees.
+    # The trees need not decide on the pairs that this rule merges.
     merge_across_occluder(segments, grid, graph.normal, labels)
     counts = count_labels(pixel_labels, labels, grid)
     view_geometry, yielded = ViewGeometry(grid.intrinsics.fx, model.up), set()
@@ -178,7 +179,7 @@ def _pairs(
 
 
 def count_labels(pixel_labels: U1, labels: I4, grid: DepthGrid) -> I4:
-    """Return the number of cells of each segment with each label, (segments, labels).
+    """Return how many cells of each segment have each pixel label, (segments, labels).
 
     Parameters
     ----------
@@ -195,7 +196,7 @@ def count_labels(pixel_labels: U1, labels: I4, grid: DepthGrid) -> I4:
 def _segment_objects(segments: Segments, counts: I4, object_labels: I4) -> tuple[I4, I4]:
     """Return the number of cells (n,) of each merged segment, and the object (n,) that it shows.
 
-    The latter is the label of an object, 0 for background, or -1 for a mixed segment.
+    An object is given by its label; 0 is background, and -1 a segment that mixes several.
     """
     joined = np.zeros_like(counts)
     np.add.at(joined, segments.parent, counts)
@@ -208,7 +209,7 @@ def _segment_objects(segments: Segments, counts: I4, object_labels: I4) -> tuple
 def _adjacent_pairs(
     segments: Segments, object_of: I4, view_geometry: ViewGeometry
 ) -> Iterator[tuple[int, int]]:
-    """Yield adjacent pairs of unmixed segments, of which at least one belongs to an object."""
+    """Yield adjacent pairs of unmixed segments; at least one of each pair shows an object."""
     n = segments.parent.size
     for p in range(1, n):
         adjacent = find_adjacent(segments, p, view_geometry)

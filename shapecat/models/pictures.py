@@ -18,7 +18,7 @@ _COLUMNS = 6
 
 
 class Mistake(NamedTuple):
-    """A view with a wrong label, the ``predicted`` one, and its confidence."""
+    """A view, its wrong ``predicted`` label, and the confidence in this label."""
 
     simulated: SimulatedView
     view: View
@@ -29,7 +29,7 @@ class Mistake(NamedTuple):
 def worst_mistakes(
     views: Sequence[SimulatedView], model: Categorizer, *, count: int = 12
 ) -> list[Mistake]:
-    """Return up to ``count`` mistakes on different objects, most confident first."""
+    """Return up to ``count`` wrong predictions for different objects, the most confident first."""
     answer = model.predict(np.array([view.descriptor for view in views]))
     mistakes = []
     for view, posterior, novelty in zip(views, answer.posteriors, answer.novelty, strict=True):

@@ -28,7 +28,7 @@ _OVERLAP = 0.5
 
 
 def detected_views(folder: Path) -> Iterator[View]:
-    """Yield the unambiguous objects of a folder, as shapecat segments them.
+    """Yield a view of each unambiguous object in each frame of a folder, as detection segments it.
 
     Missed objects, and those merged with others, are left out.
     """
@@ -63,7 +63,7 @@ def _frames(folder: Path) -> Iterator[tuple[Frame, dict[str, Any]]]:
 
 
 def _best_overlap(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int | None:
-    """Return the index of the candidate with the best IoU; None if it is too small."""
+    """Return the index of the candidate with the best IoU; None if this IoU is too small."""
     of_object = np.isin(image, item["parts"])
     shares = [
         of_object[c.indices].sum() / (of_object.sum() + np.count_nonzero(~of_object[c.indices]))
@@ -73,7 +73,7 @@ def _best_overlap(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int 
 
 
 def _nearest(scene: Scene, item: dict[str, Any]) -> int | None:
-    """Return the index of the candidate nearest to an object; None if it is too far."""
+    """Return the index of the candidate nearest to an object; None if it is too far away."""
     place = np.array(item["centroid_m"])
     gaps = [float(np.linalg.norm(c.box.center - place)) for c in scene.candidates]
     max_distance = 0.5 * max(item["extent_m"])

@@ -28,7 +28,7 @@ _OFTEN = {"kinect": 3.0, "realsense": 2.0}
 """Weights of the most common sensors; others have weight 1."""
 _DISTANCES_M = (0.25, 3.0)
 _CLOSER_M = 0.03
-"""Minimum distance from the sensor's near limit to the target."""
+"""Minimum distance by which the target is beyond the sensor's near limit."""
 
 
 class RenderedView(NamedTuple):
@@ -37,7 +37,8 @@ class RenderedView(NamedTuple):
     Attributes
     ----------
     frame : the depth image.
-    mesh_ids : (h, w) index of the object or furniture that each pixel shows, -1 without depth.
+    mesh_ids : (h, w) index of the mesh that each pixel shows, first the objects and then the
+        furniture; -1 without depth.
     visible : (k,) visible fraction of each object.
     table_from_camera : pose of the optical frame.
     sensor : name of the sensor.
@@ -68,7 +69,7 @@ def render_view(
 
 
 def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
-    """Draw a preset, half of the time mixed with another; vary its errors and resolution."""
+    """Draw a sensor: a preset, half of the time mixed with another, with random errors and size."""
     names = list(PRESETS)
     shares = np.array([_OFTEN.get(each, 1.0) for each in names])
     name, other = (str(each) for each in rng.choice(names, 2, p=shares / shares.sum()))
@@ -92,7 +93,7 @@ def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
 
 
 def _viewpoint(arrangement: Arrangement, sensor: Sensor, rng: np.random.Generator) -> Pose:
-    """Draw ``table_from_camera``, 0.25 to 3 m away, in the angles of the arrangement."""
+    """Draw ``table_from_camera``, 0.25 to 3 m from the objects, within the arrangement's angles."""
     points = np.concatenate([item.mesh.vertices for item in arrangement.objects])
     target = points.mean(axis=0) + rng.normal(0, 0.04, 3)
     nearest, farthest = _DISTANCES_M
@@ -116,8 +117,8 @@ def _visible_fractions(
 ) -> F8:
     """Return the visible fraction of each object, (count,).
 
-    The object's depth pixels are divided by its pixels in an unoccluded image twice as wide and
-    high; the fraction is 0 with fewer than `_FEWEST_PIXELS` depth pixels.
+    It is the object's number of depth pixels, divided by its number of pixels in an image twice as
+    wide and high in which nothing occludes it; 0 with fewer than `_FEWEST_PIXELS` depth pixels.
     """
     seen_pixels = np.bincount(mesh_ids[mesh_ids >= 0], minlength=count + 1)
     width, height = camera.width // _COARSE, camera.height // _COARSE

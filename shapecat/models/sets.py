@@ -42,11 +42,11 @@ WELL_SEGMENTED_IOU = 0.75
 MOSTLY_VISIBLE = 0.7
 """Minimum visible fraction of a mostly visible object."""
 _TIMES = 3
-"""How much more often a procedural family is drawn than another kind of distractor."""
+"""How many times as often a procedural family is drawn as another kind of distractor."""
 
 
 class SimulatedViews(NamedTuple):
-    """Simulated views, and the conditions (n,) of each as in `SimulatedView`."""
+    """Simulated views, and arrays (n,) of their conditions, as in `SimulatedView`."""
 
     views: DescribedViews
     resting_pose: np.ndarray
@@ -62,7 +62,7 @@ class SimulatedViews(NamedTuple):
 
 
 def options_of(name: str) -> ArrangementOptions:
-    """Return the scene parameters of the training, calibration or test set, as in `SETS`."""
+    """Return the parameters of the arrangements of a set in `SETS`."""
     kinds = [kind for k, kind in enumerate(DISTRACTORS) if (k % 3 == 0) == (name == "test")]
     if name == "training":
         kinds += _TIMES * list(PROCEDURAL)
@@ -70,7 +70,7 @@ def options_of(name: str) -> ArrangementOptions:
 
 
 def simulate(name: str, worlds: int, jobs: int) -> SimulatedViews:
-    """Simulate up to ``worlds`` arrangements of a set in `SETS`."""
+    """Simulate up to ``worlds`` arrangements of a set in `SETS`; return their views."""
     numbers = range(min(worlds, SETS[name][1]))
     views = simulate_views(options_of(name), numbers, jobs=jobs)
     click.echo(f"simulating {len(numbers)} arrangements of the {name} set", err=True)
@@ -95,8 +95,8 @@ def collect(views: Iterable[SimulatedView]) -> SimulatedViews:
 def clear_views(views: SimulatedViews) -> Bool:
     """Return the mask (n,) of whole, mostly visible, well segmented views that are not upside down.
 
-    If detection merges an object with others, no category is right. The evaluation of detection
-    covers this case; the model card lists badly segmented views in their own row.
+    If detection merges an object with others, no category is right. Badly segmented views are
+    therefore left to the evaluation of detection, and to a row of their own in the model card.
     """
     return np.asarray(~partial_views(views) & (views.resting_pose != "upside_down"))
 

@@ -45,18 +45,18 @@ _OVERLAP = 0.5
 _BACKGROUND = 0.1
 """Maximum fraction of object pixels in a detection of background."""
 _THIN_M = 0.03
-"""Maximum height of background that counts as *unknown*: higher background may have the shape of a
-category, as a cupboard is a box."""
+"""Maximum height of background that counts as *unknown*. Higher background may have the shape of a
+category: a cupboard is a box."""
 _HEIGHT = DESCRIPTOR_NAMES.index("metric.height")
 _DETECTED = 0.75
-"""Fraction of the detected objects that are segmented by detection; others, by the truth."""
+"""Fraction of the detected objects segmented by detection; the others, by the truth."""
 _FRAGMENTS = 0.3
-"""Fraction of the views of which a partial view is added."""
+"""Fraction of the views from which a partial view is cut, too."""
 _SETTINGS = Settings()
 
 
 class SimulatedView(NamedTuple):
-    """One described view and its conditions.
+    """One described view, and the conditions under which it was taken.
 
     Attributes
     ----------
@@ -68,7 +68,8 @@ class SimulatedView(NamedTuple):
     resting_pose : ``upright``, ``lying``, ``upside_down``, ``leaning`` or ``tilted``.
     source : how the view was segmented: ``truth``, ``detected`` or ``fragment``; or ``background``,
         a thin detection that shows no object, whose label is ``unknown``.
-    visible : fraction of the object's unoccluded pixels that have depth.
+    visible : number of the object's depth pixels, divided by its number of pixels if nothing
+        occluded it.
     overlap : IoU of the view's points and the object's depth pixels.
     sensor : name of the sensor.
     view : the voxels; None if not kept.
@@ -88,7 +89,7 @@ class SimulatedView(NamedTuple):
 
 
 class _Conditions(NamedTuple):
-    """Label and conditions of an object, or of background, in an image, as in `SimulatedView`."""
+    """Label and conditions of an object or of background; fields as in `SimulatedView`."""
 
     label: str
     resting_pose: str
@@ -100,7 +101,7 @@ class _Conditions(NamedTuple):
 def simulate_views(
     options: ArrangementOptions, numbers: Sequence[int], *, jobs: int = 1
 ) -> Iterator[SimulatedView]:
-    """Yield the views of the arrangements with these numbers, in order.
+    """Simulate the arrangements with these numbers; yield their views in this order.
 
     The number of jobs does not affect the result.
     """
@@ -194,7 +195,7 @@ def _views_of(
     instance: str,
     rng: np.random.Generator,
 ) -> list[SimulatedView]:
-    """Return a view of an object, segmented by truth or detection, and sometimes a partial view."""
+    """Return a view of object ``k``, segmented by truth or detection, and sometimes a fragment."""
     detected = _segment_by_detection(image, scene, k)
     if detected is not None and rng.random() < _DETECTED:
         (view, overlap), source = detected, "detected"
@@ -214,7 +215,7 @@ def _views_of(
 
 
 def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> list[SimulatedView]:
-    """Return the thin detections that do not show any of the first ``objects`` meshes."""
+    """Return views of the thin detections that show none of the ``objects`` objects."""
     mesh_ids = image.mesh_ids.reshape(-1)
     views = []
     for candidate in scene.candidates:
@@ -227,7 +228,7 @@ def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> l
 
 
 def _segment_by_detection(image: RenderedView, scene: Scene, k: int) -> tuple[View, float] | None:
-    """Return the object as segmented by detection, and the IoU; None if it was missed."""
+    """Return the detection of object ``k`` as a view, and its IoU; None if detection missed it."""
     mesh_ids = image.mesh_ids.reshape(-1)
     valid = np.asarray(image.frame.depth).reshape(-1) > 0
     total = int(np.count_nonzero((mesh_ids == k) & valid))
@@ -250,7 +251,10 @@ def _view_of(image: RenderedView, scene: Scene, candidate: Candidate) -> View:
 def _segment_by_truth(
     image: RenderedView, k: int, item: ArrangedObject, rng: np.random.Generator
 ) -> View:
-    """Return the object's true points in a level frame with errors of half a degree and 2 mm."""
+    """Return the true points of object ``k`` in its level frame.
+
+    The frame has random errors of about half a degree and 2 mm, as if detection had found it.
+    """
     indices = np.flatnonzero((image.mesh_ids == k) & (np.asarray(image.frame.depth) > 0))
     points = image.frame.xyz(indices)
     camera_from_table = inverse(image.table_from_camera)
@@ -268,10 +272,10 @@ def _centre(item: ArrangedObject) -> F8:
 
 
 def _described(view: View, source: str, conditions: _Conditions) -> SimulatedView | None:
-    """Describe the voxels of a view, which also seed the random generator; None if too few."""
+    """Describe the voxels of a view; return None if there are too few for a surface."""
     distance = float(np.linalg.norm(view.points.mean(axis=0) - view.eye))
     view = replace(view, points=voxelize(view.points, voxel_m=_SETTINGS.surface.voxel_m))
-    rng = np.random.default_rng(crc32(view.points.tobytes()))
+    rng = np.random.default_rng(crc32(view.points.tobytes()))  # equal views, equal descriptors
     described = describe_view(view, settings=_SETTINGS, rng=rng)
     if described is None:
         return None

@@ -1,8 +1,8 @@
 """Grow the trees that reject background structure: ``python -m shapecat.models.structure``.
 
 Simulated scenes of several kinds, seen by all sensors, give merged segments of objects, of
-furniture and walls, and of noise. Grow the trees of `shapecat.models.parts` first, as they merge
-the segments.
+furniture and walls, and of noise. Grow the trees of `shapecat.models.parts` first, since they
+decide how the segments are merged.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -46,7 +46,7 @@ __all__ = ["Samples", "Series", "collect", "grow_rejection_trees", "label_object
 
 _GROWTH = Growth(500, 64, 0.06)
 _FOLDS = 3
-"""Parts of the samples, each classified by trees trained on the others."""
+"""Number of parts of the samples; trees trained on the other parts classify each part."""
 _OBJECT = 0.5
 """A merged segment is an object if more than this fraction of its labelled cells shows objects."""
 _CHUNK = 10
@@ -58,14 +58,14 @@ class Series(NamedTuple):
     Attributes
     ----------
     first, scenes : the first seed and the number of scenes.
-    sensors : used in turn.
+    sensors : names of the sensors, used in turn.
     scale : factor of all sizes and distances.
     view : where the camera is: on the ``path`` of the scene, or ``anywhere`` around it (near or
         far, low or straight above); ``floor`` is anywhere, with the table removed.
-    changed : turns a bin into a tote, or a shelf into a rack.
-    arms : arms of the robot with the camera, or of a person: ``reaching`` for the objects, or
-        ``resting`` at the image border.
-    coarse : whether images have a fraction of the sensor's resolution.
+    changed : function that turns a bin into a tote, or a shelf into a rack.
+    arms : arms in view, of the robot that carries the camera or of a person: ``reaching`` for the
+        objects, or ``resting`` on the support at the image border.
+    coarse : whether images have only a half to a quarter of the sensor's resolution.
     """
 
     kind: SceneKind
@@ -128,20 +128,20 @@ _SERIES = (
     Series("clutter", 665_500, 90, scale=1.8, view="anywhere"),
     Series("tabletop", 666_000, 90, scale=1.8, view="anywhere"),
 )
-"""The merging trees were not trained on these seeds. The scaled scenes add large objects, which are
-too rare otherwise; rooms add arms and furniture, floors objects where furniture usually is."""
+"""The merging trees were not trained on these seeds. Scaled scenes add large objects, which are
+otherwise too rare; rooms add arms and furniture; floors add objects where furniture usually is."""
 _VIEWS = {"path": 2, "anywhere": 6, "floor": 6}
-"""Views of each scene, with one sensor after the other; on the path, from a single place."""
+"""Number of views of each scene, by different sensors; on the path, all from its first pose."""
 
 
 class Samples(NamedTuple):
-    """The merged segments of several frames.
+    """The n merged segments of several frames.
 
     Attributes
     ----------
     features : (n,) `OBJECT_FEATURES`.
-    objects : (n,) whether each is an object.
-    weights : for each frame, the borders of its segments, from `measure_borders`.
+    objects : (n,) whether each segment shows an object.
+    weights : for each frame, the border lengths of its segments, from `measure_borders`.
     """
 
     features: Records
@@ -165,7 +165,7 @@ def main(*, seed: int, jobs: int, out: Path) -> None:
 def collect(scenes: tuple[Series, ...], jobs: int) -> list[Samples]:
     """Return the merged segments of all scenes; the number of jobs does not affect the result.
 
-    Each item holds whole scenes, so that folds never split a scene.
+    Each `Samples` holds whole scenes, so that no scene is in two folds.
     """
     return collect_chunks(_collect, scenes, _CHUNK, jobs)
 
@@ -173,8 +173,8 @@ def collect(scenes: tuple[Series, ...], jobs: int) -> list[Samples]:
 def grow_rejection_trees(samples: Sequence[Samples], seed: int) -> RejectionTrees:
     """Grow the trees that classify segments alone, and those that classify them in context.
 
-    The second ones learn from the uncertain segments, with logits of trees that were trained on the
-    other parts of the samples.
+    The trees in context learn only from the segments of which the first trees are uncertain. The
+    logits of these segments come from trees that were trained on other parts of the samples.
     """
     rows = [as_rows(part.features) for part in samples]
     objects = [part.objects for part in samples]
@@ -198,7 +198,10 @@ def _grow(rows: Sequence[F4], objects: Sequence[Bool], seed: int) -> BoostedTree
 
 
 def _in_context(samples: Samples, logits: F4) -> F4:
-    """Return the features in context of segments that alone have these ``logits`` (n,)."""
+    """Return the context features (n, f) of segments.
+
+    ``logits`` (n,) are those of the trees that classify each segment alone.
+    """
     stops = np.cumsum([0, *(weights.shape[1] for weights in samples.weights)])
     frames = [
         add_context(samples.features[a:b], logits[a:b], weights)
@@ -218,7 +221,10 @@ def _collect(series: Series) -> Samples:
 
 
 def _views(series: Series, seed: int) -> Iterator[Samples]:
-    """Yield the segments of every view of one scene; a view costs a tenth of the scene."""
+    """Yield the segments of each view of one scene.
+
+    Making the scene takes ten times as long as a view.
+    """
     rng = np.random.default_rng(seed)
     world = make_scene(series.kind, rng, frames=1)
     world = move_to_floor(world) if series.view == "floor" else world
@@ -238,9 +244,9 @@ def _views(series: Series, seed: int) -> Iterator[Samples]:
 def _with_arms(
     world: World, view: Pose | int, intrinsics: Camera, arms: str, rng: np.random.Generator
 ) -> World:
-    """Add the arms of the robot whose camera takes the frame, or of a person beside it.
+    """Add arms to a world: those of the robot that carries the camera, or of a person.
 
-    ``arms`` is as in `Series`; ``intrinsics`` belong to the camera at ``view``.
+    ``arms`` is as in `Series`; ``view`` and ``intrinsics`` are those of the camera.
     """
     if arms == "none":
         return world
@@ -254,7 +260,7 @@ def _with_arms(
 
 
 def label_objects(frame: Frame, pixel_labels: U1, object_labels: I4) -> Iterator[Samples]:
-    """Yield the merged segments of a frame, if it shows a supporting plane.
+    """Yield the merged segments of a frame; nothing if it shows no supporting plane.
 
     Parameters
     ----------

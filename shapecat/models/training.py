@@ -22,7 +22,7 @@ _REJECTED = 0.14
 """Fraction of the partial views of known categories that the novelty threshold rejects. Real
 objects are often partly hidden, and a partial view is more novel than a whole one."""
 _TREES: dict[str, Any] = {"rounds": 320, "leaves": 40, "rate": 0.09}
-"""With so many views, the trees can be larger than the default; there are fewer of them, so that
+"""With so many views, the trees can be larger than by default. There are fewer of them, so that
 training takes the same time."""
 
 
@@ -54,7 +54,7 @@ def main(
 
 
 def _fit(train: SimulatedViews, held_out: SimulatedViews, seed: int, jobs: int) -> Categorizer:
-    """Train a model; fit its temperature on all held-out views, its threshold on partial ones."""
+    """Train a model; fit its temperature on all held-out views, its threshold on partial views."""
     choices = {"jobs": jobs, "rejected": _REJECTED, **_TREES}
     model = fit_views(train.views, held_out.views, seed=seed, **choices)
     views = held_out.where(partial_views(held_out)).views

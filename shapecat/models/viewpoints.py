@@ -13,9 +13,9 @@ from shapecat.types import Pose
 __all__ = ["move_to_floor", "random_viewpoint"]
 
 _DISTANCE_M, _ELEVATION_DEG, _SWEEP_DEG = (0.35, 2.6), (12.0, 84.0), (20.0, 150.0)
-"""Ranges of the position of the camera, relative to its target."""
+"""Ranges of the camera's position relative to its target, as for `arc_orbit`."""
 _CLOSER_M = 0.08
-"""Minimum distance of the target beyond the sensor's near limit."""
+"""Minimum distance by which the target is beyond the sensor's near limit."""
 
 
 def random_viewpoint(
@@ -31,7 +31,7 @@ def random_viewpoint(
 
     Parameters
     ----------
-    distance_m : nearest and farthest distance of a point among the objects, metres.
+    distance_m : minimum and maximum distance from a point among the objects, metres.
     """
     places = [item.pose.translation for item in world.objects]
     if not places:
@@ -51,7 +51,7 @@ def random_viewpoint(
 
 
 def move_to_floor(world: World) -> World:
-    """Remove the table and everything on it except the objects, and put these on the floor."""
+    """Remove the table, and the arms and the screen on it; put the objects on the floor."""
     table = next(support for support in world.supports if support.name == "table")
     down = np.array([0.0, 0.0, -table.height])
     objects = (
