@@ -49,8 +49,8 @@ def grow_ensemble(
 ) -> BoostedEnsemble:
     """Grow gradient-boosted trees; a logit is the sum of the values of a view's leaves.
 
-    Each round grows one tree per category against the rest, on the residual of its posterior. The
-    trees and the classifiers, which sum their leaf values, are thus learned together.
+    Each round grows one tree per category against the rest, on the residual of the category's
+    posterior. Thus the trees and the classifiers, which sum the leaf values, are learned together.
 
     Parameters
     ----------
@@ -86,10 +86,10 @@ def _boost(
 ) -> list[Tree]:
     """Grow one tree per category in each round; return them round by round.
 
-    The leaf values of all trees are added to ``scores`` (k, n).
+    The leaf values of all trees are added to ``scores`` (k, n), the logits of the n views.
     """
     truth = labels == np.arange(len(scores))[:, None]
-    # One of K logits is free, so each moves (K - 1) / K of the way (Friedman 2001, eq. 36).
+    # Only K - 1 of K logits are independent: each moves (K - 1) / K as far (Friedman 2001, eq. 36).
     freedom = np.float32(len(scores) / (len(scores) - 1))
     trees: list[Tree] = []
     with ThreadPoolExecutor(jobs) as pool:

@@ -102,7 +102,7 @@ def grow_tree(
 
 
 def joined(grown: Sequence[Tree]) -> BoostedTrees:
-    """Concatenate the nodes of all trees."""
+    """Join trees into one ensemble, whose score is the sum of theirs."""
     roots = np.cumsum([0, *(len(tree.left) for tree in grown)])
     left = [np.where(t.left > 0, t.left + root, 0) for t, root in zip(grown, roots, strict=False)]
     trees = Trees(
@@ -130,7 +130,10 @@ def _grow(
     left: I4,
     value: F4,
 ) -> int:
-    """Write the nodes into ``feature``, ``cut``, ``left`` and ``value``; return their number."""
+    """Grow a tree into ``feature``, ``cut``, ``left`` and ``value``; return its number of nodes.
+
+    ``cut`` is the last bin that goes left; the other parameters are as for `grow_tree`.
+    """
     room = feature.size
     first, last = np.zeros(room, np.int64), np.zeros(room, np.int64)
     best = np.zeros((room, 3))  # gain, index into columns, bin
@@ -169,7 +172,7 @@ def _grow(
 
 @kernel(inner=True)
 def _collect(binned: U1, columns: I4, rows: I4, gradient: F4, hessian: F4, sums: F4) -> None:
-    """Add gradient and hessian of the views in ``rows`` to ``sums`` (columns, BINS, 2)."""
+    """Add the gradient and hessian of the views in ``rows`` to ``sums`` (columns, BINS, 2)."""
     g, h = gradient[rows], hessian[rows]
     for c in range(columns.size):
         bins, out = binned[columns[c]], sums[c]

@@ -26,14 +26,15 @@ def fit_temperature(logits: F8, labels: I4, objects: int) -> float:
     """Return the temperature T that makes ``softmax(logits / T)`` fit the labels best.
 
     T minimises the negative log-likelihood in [0.05, 20]. It does not change the order of the
-    categories of a view. If all n objects are categorized correctly, the likelihood would be
-    largest for a confidence of 1; the target is then (n + 1) / (n + 2) for the true category.
+    categories of a view. If all views are categorized correctly, the likelihood would be largest
+    for a confidence of 1. The true category then has the target (k + 1) / (k + 2), where k is the
+    number of objects.
 
     Parameters
     ----------
     logits : (n, c).
-    labels : (n,) true column of each row.
-    objects : number of objects that the rows show.
+    labels : (n,) true column of each view.
+    objects : number of objects that the views show.
 
     Sources: Guo et al. 2017, section 4.2; targets: Platt 1999.
 

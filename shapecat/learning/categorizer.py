@@ -22,7 +22,7 @@ MOST_CATEGORIES = 254
 """Maximum number of categories of a model."""
 
 _LARGEST = 1e6
-"""Bound on the weights of a model: far above real ones, and their sums stay finite."""
+"""Maximum magnitude of a model's weights: real ones are far smaller, and sums stay finite."""
 
 
 class Prediction(NamedTuple):
@@ -39,13 +39,13 @@ class Prediction(NamedTuple):
 
 
 class Categorizer(Record):
-    """The fitted model: features, boosted trees, a classifier per category, novelty.
+    """A fitted model, which turns descriptors into posteriors and novelty.
 
     Attributes
     ----------
     categories : names of the columns of the posterior.
     descriptor_names : names of the descriptor's components, in order.
-    standardisation : standardises a descriptor, which gives the features.
+    standardisation : turns a descriptor into features.
     forest : the boosted trees.
     leaf_values : (l, k) the value that each leaf adds to each logit. k is c, the number of
         categories, or c + 1 if the model was trained with unknown shapes, whose logit comes last.
@@ -55,7 +55,7 @@ class Categorizer(Record):
     threshold : log odds of being unknown above which a shape is *unknown*.
     known_descriptors : (v, d) standardised descriptors of some training views, which are the
         negative examples for new categories.
-    known_category : (v,) index of the logit of each of these views.
+    known_category : (v,) index of the true logit of each of these views.
     notes : origin of the model and its training settings; plain JSON values.
 
     Raises
@@ -169,7 +169,7 @@ class Categorizer(Record):
 
 
 def parts_of(record: Record, prefix: str = "") -> dict[str, Any]:
-    """Return the fields of nested records by dotted name: arrays and plain values."""
+    """Return the fields of nested records, which are arrays or plain values, by dotted name."""
     parts: dict[str, Any] = {}
     for item in fields(record):  # type: ignore[arg-type]  # every Record is a dataclass
         value = getattr(record, item.name)
@@ -219,7 +219,7 @@ def _predict(
             total += np.exp(logits[c] - best)
         for c in range(categories):
             posteriors[i, c] = np.exp(logits[c] - best) / total
-        # (3) Novelty: the odds of being unknown, or else of not being the best category.
+        # (3) Novelty: the odds of *unknown*; without its logit, of any category but the best.
         if bias.size > categories:
             odds = logits[categories] - best - np.log(total)
         else:

@@ -7,7 +7,7 @@ from shapecat.arrays import F4, Record, array
 __all__ = ["Standardisation", "fit_standardisation"]
 
 _CLIP = 8.0
-"""Standardised values are clipped to this many standard deviations."""
+"""Maximum magnitude of a standardised value; larger ones are clipped."""
 
 
 class Standardisation(Record):
@@ -15,7 +15,8 @@ class Standardisation(Record):
 
     Attributes
     ----------
-    mean, inverse_scale : (d,) standardisation; a constant component has inverse scale 0.
+    mean, inverse_scale : (d,) mean of each component, and the inverse of its standard deviation;
+        0 for a constant component.
 
     Raises
     ------

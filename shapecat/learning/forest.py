@@ -48,7 +48,7 @@ class FlatForest(Record):
 
     @cached_property
     def leaf_id(self) -> I4:
-        """The id of each leaf, (n,); meaningless for inner nodes."""
+        """(n,) the id of each leaf; meaningless for inner nodes."""
         return (np.cumsum(self.left == 0) - 1).astype(np.int32)
 
     @property
@@ -58,12 +58,12 @@ class FlatForest(Record):
 
     @cached_property
     def parameters(self) -> tuple[Trees, I4]:
-        """The trees and leaf ids for `apply`; small types keep a large forest in the cache."""
+        """The trees and leaf ids for `apply`; small types keep a large forest in the CPU cache."""
         left = self.left.astype(np.int32)
         return Trees(self.roots, self.feature, self.threshold, left), self.leaf_id
 
     def apply(self, features: F4) -> I4:
-        """Return the leaf ids (n, t), one for each tree, of features (n, f).
+        """Return the ids (n, t) of the leaves that features (n, f) reach in each tree.
 
         Raises
         ------

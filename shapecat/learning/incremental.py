@@ -20,16 +20,16 @@ _L2 = 1e-2
 """Strength of the L2 regularisation, per view."""
 _FOLDS = 4
 _STEPS = 150
-"""Iterations of the minimiser from zero."""
+"""Maximum number of iterations of the minimiser if it starts from zero weights."""
 _FEW_STEPS = 40
-"""Iterations of the minimiser from the solution for all folds."""
+"""Maximum number of iterations in a fold, which starts from the weights fitted on all views."""
 _LOST = 0.006
 """Fraction of the correctly categorized known views that new categories may take over."""
 _LARGEST_SHIFT = 2.0
 
 
 class _Inputs(NamedTuple):
-    """Inputs of the new classifiers, of n views.
+    """Inputs of the new classifiers for n views.
 
     Attributes
     ----------
@@ -156,7 +156,8 @@ def _logits(inputs: _Inputs, weights: F8) -> F8:
 def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, l2: float, steps: int) -> F8:
     """Return the weights (`_width`, new categories) of the new logits.
 
-    ``old`` (n, k) are the old logits, divided by the temperature; ``truth`` (n,) true columns.
+    ``old`` (n, k) are the old logits, divided by the temperature. ``truth`` (n,) is the true column
+    of each view, where new columns follow the old ones. ``start`` are initial weights.
     """
     views, first = old.shape
     count = start.shape[1]
@@ -194,7 +195,8 @@ def _shift(
 ) -> float:
     """Return the largest constant for the new logits that takes few views from old categories.
 
-    It is measured by cross-validation on the views that the old logits categorize correctly.
+    Cross-validation counts these views, among those that the old logits categorize correctly. The
+    parameters are as for `_fit_new`; ``learned`` are its weights.
     """
     fold = rng.permutation(len(truth)) % _FOLDS
     new = np.zeros((len(truth), learned.shape[1]))

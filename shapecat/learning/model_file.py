@@ -64,12 +64,12 @@ def save_model(path: Path, categorizer: Categorizer) -> None:
 
 
 def require_model_path(path: Path, *, overwrite: bool = True) -> None:
-    """Check that a model can be written to a path, and replaces nothing but a model.
+    """Check that a model can be written to a path, and would replace nothing but a model.
 
     Raises
     ------
-    OutputError : it cannot be written, or the file exists and is not a model, or no model may be
-        replaced.
+    OutputError : it cannot be written, or the file exists and is not a model, or it is a model and
+        ``overwrite`` is false.
     """
     require_writable(path)
     with explained(f"{path}: cannot be read", OutputError):
@@ -101,8 +101,8 @@ def _write_member(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
 def load_model(path: Path | None = None) -> Categorizer:
     """Read a model; without a path, read the default model that comes with the package.
 
-    No file can run code, crash or hang the reader: sizes are bounded by the content of the file,
-    and every index is checked.
+    No file can run code, or crash or hang the reader: the size of the file bounds all sizes, and
+    every index is checked.
 
     Raises
     ------
@@ -150,7 +150,7 @@ def _parse(content: bytes) -> Categorizer:
 
 
 def _read_members(content: bytes) -> dict[str, bytes]:
-    """Unpack an archive without trusting the sizes it states."""
+    """Unpack the members of an archive, without trusting the sizes that it states."""
     if len(content) > _LARGEST_FILE:
         msg = f"it is larger than {_LARGEST_FILE >> 20} MB"
         raise _NotAModelError(msg)
@@ -198,7 +198,7 @@ def _parse_array(data: bytes) -> np.ndarray:
 
 
 def _assemble(kind: type[_Record], parts: Mapping[str, Any], prefix: str) -> _Record:
-    """Build nested records from fields by dotted name; the opposite of `parts_of`."""
+    """Build a record from its fields by dotted name; the inverse of `parts_of`."""
     values: dict[str, Any] = {}
     hints = get_type_hints(kind)
     for item in fields(kind):  # type: ignore[arg-type]  # every Record is a dataclass
@@ -214,7 +214,7 @@ def _assemble(kind: type[_Record], parts: Mapping[str, Any], prefix: str) -> _Re
 
 
 def _checked(key: str, value: Any, hint: Any, dtype: str | None) -> Any:
-    """Return a value, converted to its field's type, or raise `_NotAModelError`."""
+    """Convert a value to the type of its field; raise `_NotAModelError` if it has another type."""
     if dtype is not None:
         good = isinstance(value, np.ndarray) and value.dtype == np.dtype(f"<{dtype}")
     elif hint == tuple[str, ...]:

@@ -25,7 +25,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class LearningSettings:
-    """Settings of the training."""
+    """Settings for training a model."""
 
     rounds: int = 500
     """Boosting rounds; each grows one tree per category."""
@@ -34,7 +34,7 @@ class LearningSettings:
     rate: float = 0.06
     """Learning rate of the boosting."""
     known_views: int = KNOWN_VIEWS
-    """Views stored in the model as negative examples for new categories."""
+    """Number of views stored in the model as negative examples for new categories."""
     rejected: float = 0.05
     """Fraction of held-out views of known categories that the novelty threshold rejects."""
     jobs: int = 1
@@ -134,7 +134,7 @@ def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) 
     Parameters
     ----------
     held_out : views of instances that training has not seen. Views whose label is not a category of
-        the model are ignored; if none remain, the model is returned unchanged.
+        the model are ignored; if no views remain, the model is returned unchanged.
     rejected : fraction of the views that the novelty threshold rejects.
     """
     codes = encode(held_out.labels, categorizer.categories)
