@@ -1,4 +1,4 @@
-"""Baseline classifiers."""
+"""Baseline classifiers, to which shapecat's classifier is compared."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Self
@@ -17,11 +17,11 @@ from shapecat.learning.calibration import softmax
 __all__ = ["Densities", "make_baselines"]
 
 _MULTIPLES = np.exp2(np.arange(-2.0, 2.6, 0.5))
-"""Bandwidths to choose from, relative to the typical distance of kernels."""
+"""Bandwidths to choose from, relative to the typical distance between kernels."""
 _VALIDATION_VIEWS = 60
-"""Number of views per category on which a bandwidth is fitted."""
+"""Maximum number of views per category on which a bandwidth is fitted."""
 _CLIP = 8.0
-"""Standardised values and densities are clipped to this many standard deviations."""
+"""Maximum magnitude of standardised values and densities; larger ones are clipped."""
 
 
 def make_baselines(blocks: Sequence[slice]) -> dict[str, Callable[[], Any]]:
@@ -62,8 +62,8 @@ class Densities:
 
     Notes
     -----
-    The bandwidth of a block is a multiple of the typical distance between nearest kernels: the one
-    that maximises the likelihood of views under their own category, each view left out.
+    The bandwidth of a block is a multiple of the typical distance between nearest kernels. It
+    maximises the leave-one-out likelihood of views under their own category.
 
     Source: Specht 1990, eq. 12; differs: Specht keeps every training view.
     """
@@ -88,7 +88,7 @@ class Densities:
     def log_densities(self, x: F4) -> F8:
         """Return the log densities (n, categories, blocks) of descriptors (n, d).
 
-        They are relative to the densities of views under their own category.
+        In each block, those of views under their own category have mean 0 and standard deviation 1.
         """
         z = self.standardise(x)
         densities = [
@@ -126,8 +126,8 @@ def _log_density(z: F8, kernels: F8, width: float) -> F8:
     """Return the log (n,) of the mean Gaussian around kernels (k, d) at views (n, d).
 
     The factor that is the same for every category is left out. A kernel at a view does not count,
-    since it is probably this view itself, from the training set: otherwise the densities of
-    training views would be too high. The result is -inf if no kernel counts.
+    since it is probably this view itself, which would make the densities of training views too
+    high. The result is -inf if no kernel counts.
     """
     squared = cdist(z, kernels, "sqeuclidean")
     other = squared > 1e-4 * z.shape[1]

@@ -24,7 +24,7 @@ _FOLDS = 5
 
 
 _Learner = Callable[[DescribedViews, DescribedViews, tuple[str, ...]], F8]
-"""Trains on some views; returns the posteriors (n, c) of others for the given categories."""
+"""Returns the posteriors (n, c) of test views, given training views, test views and categories."""
 
 
 def compare_learners(
@@ -40,14 +40,15 @@ def compare_learners(
     Parameters
     ----------
     test : test views; those labelled ``unknown`` are left out.
-    train : training views. If None, use ``test`` in cross-validation by instance, up to 5 folds.
-    categories : order of the posteriors; a category without training views counts as missed.
+    train : training views. If None, use ``test`` in cross-validation by instance, in up to 5 folds.
+    categories : order of the posteriors. A category without training
+        views counts as wrong.
     root : folder of the data set, which error messages name.
 
     Returns
     -------
     Results of shapecat's classifier, of those in `shapecat.evaluation.baseline_classifiers`, and of
-    forests on shape distributions (D2; D2, D3 and A3 together).
+    two forests on shape distributions: on D2, and on D2, D3 and A3 together.
 
     Raises
     ------
@@ -72,7 +73,7 @@ def compare_learners(
 
 
 def _folds(views: DescribedViews) -> Iterator[tuple[DescribedViews, DescribedViews]]:
-    """Yield training and test views; all views of an instance are on one side."""
+    """Yield training and test views of each fold; all views of an instance are on one side."""
     from sklearn.model_selection import StratifiedGroupKFold  # noqa: PLC0415  only needed here
 
     fewest = min(_instances(views).values())
@@ -85,7 +86,7 @@ def _folds(views: DescribedViews) -> Iterator[tuple[DescribedViews, DescribedVie
 
 
 def _mean_views(splits: list[tuple[DescribedViews, DescribedViews]], *, with_unknown: bool) -> int:
-    """Return the mean number of training views of the splits."""
+    """Return the mean number of training views over the splits."""
     counts = [np.sum(with_unknown | (train.labels != UNKNOWN)) for train, _ in splits]
     return round(float(np.mean(counts)))
 
@@ -144,13 +145,13 @@ def _learners() -> dict[str, _Learner]:
 
 
 def _chain(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
-    """Run shapecat's classifier; like `shapecat train`, it also learns unknown shapes."""
+    """Train and test shapecat's classifier; unlike the baselines, it also learns unknown shapes."""
     model = fit_views(train, train.where(np.zeros(0, np.int64)), seed=0)
     return _in_order(model.predict(test.descriptors).posteriors, model.categories, categories)
 
 
 def _plain(make: Callable[[], Any], features: Callable[[DescribedViews], F4]) -> _Learner:
-    """Return a plain classifier on features of the views; unknown shapes are left out."""
+    """Return a learner: a scikit-learn classifier on features, trained without unknown shapes."""
 
     def learn(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
         known = train.where(train.labels != UNKNOWN)
@@ -161,7 +162,7 @@ def _plain(make: Callable[[], Any], features: Callable[[DescribedViews], F4]) ->
 
 
 def _in_order(posteriors: F4, found: Any, categories: tuple[str, ...]) -> F8:
-    """Return the columns in the order of ``categories``; 0 for those missing in ``found``."""
+    """Return columns, named ``found``, in the order of ``categories``; 0 for missing ones."""
     names = [str(name) for name in found]
     result = np.zeros((len(posteriors), len(categories)))
     for column, name in enumerate(categories):

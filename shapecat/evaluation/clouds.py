@@ -35,7 +35,7 @@ class CloudFile(NamedTuple):
     """The content of a point cloud file.
 
     ``points`` (n, 3) are as stored, including NaN; ``viewpoint`` (3,) is the position of the
-    sensor, None if the file has none.
+    sensor, None if the file does not state it.
     """
 
     points: F8
@@ -43,7 +43,7 @@ class CloudFile(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Storage of points: NumPy type of a point, their number, encoding, and first byte."""
+    """How a file stores points: type of one point, number of points, encoding, and first byte."""
 
     point: np.dtype
     number: int
@@ -156,7 +156,7 @@ def _ply_header(content: bytes) -> tuple[F8 | None, _Layout]:
 
 
 def _xyz(body: bytes, layout: _Layout) -> F8:
-    """Return the points (n, 3) of an ascii or binary body; the body's size bounds the memory."""
+    """Return the points (n, 3) of an ascii or binary body, whose size bounds the memory."""
     if layout.encoding == "ascii":
         columns = _ascii_columns(layout.point)
         lines = body.decode("ascii", "replace").splitlines()
@@ -183,7 +183,7 @@ def _ascii_columns(point: np.dtype) -> list[int]:
 
 
 def _unpack_pcd(body: bytes, layout: _Layout) -> F8:
-    """Return the points (n, 3) of a compressed body, which stores field after field."""
+    """Return the points (n, 3) of a compressed body, which stores one field after the other."""
     packed, size = np.frombuffer(body, "<u4", count=2).tolist()
     if size != layout.number * layout.point.itemsize or packed > len(body) - 8:
         msg = "the compressed data is not as long as the header says"

@@ -96,7 +96,7 @@ def read_dataset(root: Path) -> Dataset:
 
 
 def _views_among(root: Path, pattern: str) -> list[Path]:
-    """Return the paths below a folder that end like views, sorted, without hidden ones."""
+    """Return the paths of the views below a folder, by suffix, sorted, without hidden ones."""
     return sorted(
         path
         for path in root.glob(pattern)

@@ -36,8 +36,8 @@ def evaluate_folder(
 
     Raises
     ------
-    RecordingError : there are no views, one cannot be read, a folder has an invalid name, or there
-        are too few to train on, or the training set of the baselines holds a view of ``root``.
+    RecordingError : there are no views, one cannot be read, a folder has an invalid name, there are
+        too few views to train on, or the training set of the baselines holds a view of ``root``.
     ModelError : the model is unusable, or does not know a category of the data set.
     """
     categorizer = load_model(model)

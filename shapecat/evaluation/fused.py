@@ -11,7 +11,7 @@ from shapecat.tracking import fuse
 __all__ = ["FUSED", "Fused", "fuse_views"]
 
 FUSED = (3, 10, 30)
-"""Numbers of views that are fused."""
+"""Numbers of views to fuse."""
 
 
 class Fused(NamedTuple):
@@ -26,10 +26,9 @@ class Fused(NamedTuple):
 def fuse_views(truth: I4, posteriors: F4, objects: np.ndarray) -> tuple[Fused, ...]:
     """Fuse the views of each object in groups of consecutive views, and measure the accuracy.
 
-    Leftover views are not used.
-
-    The errors of an object's views are correlated, so the product of their posteriors is tempered
-    by their number, as in tracks. A plain product would be overconfident, a mean underconfident.
+    Views that do not fill a group are not used. The errors of an object's views are correlated, so
+    the product of their posteriors is tempered by their number, as in tracks. A plain product would
+    be overconfident, a mean underconfident.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Names of category folders: runs of a model that learned them must accept them as labels."""
+"""Rules for names of category folders: a model learns them, and its runs use them as labels."""
 
 import unicodedata
 from collections.abc import Iterable
@@ -12,7 +12,7 @@ __all__ = ["require_category_names"]
 
 
 def require_category_names(root: Path, names: Iterable[str], known: Iterable[str] = ()) -> None:
-    """Check the category folders of a data set.
+    """Check that the category folders of a data set have valid names.
 
     Parameters
     ----------

@@ -100,7 +100,7 @@ def format_page(report: Report, *, title: str) -> str:
 
 
 def format_markdown(report: Report, *, title: str, pictures: Mapping[str, str]) -> str:
-    """Return an evaluation as Markdown; ``pictures`` are the pictures' file names, by name."""
+    """Return an evaluation as Markdown; ``pictures`` maps the name of each picture to its file."""
     pictures = {name: quote(file) for name, file in pictures.items()}
     parts = [
         f"# {_plain(title)}",
@@ -136,7 +136,7 @@ def _figures(report: Report) -> Rows:
 
 
 def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> str:
-    """Return a confusion matrix ``table`` (c, c) as SVG, shaded by the fraction of the row."""
+    """Return a confusion matrix ``table`` (c, c) as SVG, shaded by the fraction of each row."""
     margin = max(_MARGIN, 16 + _LETTER * max(map(len, categories), default=0))
     size = margin + _CELL * len(categories)
     parts: list[str] = []
@@ -195,7 +195,7 @@ def calibration_svg(curve: Sequence[Bin]) -> str:
 def accuracy_svg(ranges: Ranges) -> str:
     """Return accuracies as bars in SVG; a bar's thickness shows its number of views.
 
-    ``ranges`` are (name, views, accuracy).
+    ``ranges`` are tuples of name, number of views and accuracy.
     """
     width, low, step = 480, 96, 34  # room for the longest label
     side = width - low - 56
@@ -239,5 +239,5 @@ def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return text with the markup characters of Markdown and HTML escaped."""
+    """Return text for one line of Markdown: HTML characters and ``|`` are escaped."""
     return escape(text).replace("|", "\\|").replace("\n", " ")

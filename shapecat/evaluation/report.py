@@ -37,7 +37,7 @@ __all__ = [
 Row: TypeAlias = tuple[str, ...]
 Rows: TypeAlias = list[Row]
 Ranges: TypeAlias = tuple[tuple[str, int, float], ...]
-"""Range, number of views and accuracy."""
+"""Name of each range, its number of views, and their accuracy."""
 
 _ELEVATIONS = (-math.inf, 15.0, 30.0, 45.0, 60.0, math.inf)
 _DISTANCES_M = (0.0, 0.8, 1.1, 1.4, 1.7, math.inf)
@@ -47,10 +47,10 @@ _POINTS = (0, 60, 120, 250, 500, 1000, math.inf)
 
 
 class Compared(NamedTuple):
-    """Results of a classifier; undefined metrics are None.
+    """Results of the classifier named ``learner``; undefined metrics are None.
 
-    ``learned`` is the number of views that it was trained on, in cross-validation the mean over the
-    folds.
+    ``learned`` is the number of views that it was trained on; in cross-validation, the mean over
+    the folds.
     """
 
     learner: str
@@ -104,7 +104,7 @@ class Report:
 
     @property
     def breakdowns(self) -> tuple[tuple[str, Ranges], ...]:
-        """The name and the rows of each breakdown that has rows."""
+        """The name and the rows of each breakdown that is not empty."""
         parts = (
             ("distance", self.by_distance),
             ("elevation", self.by_elevation),
@@ -266,13 +266,16 @@ def _confusion(report: Report) -> Rows:
 
 
 def breakdown_table(name: str, ranges: Ranges) -> tuple[Row, Rows]:
-    """Return header and rows of a table of accuracies."""
+    """Return header and rows of the table of a breakdown; ``name`` says by what."""
     rows: Rows = [(label, str(count), figure_text(value)) for label, count, value in ranges]
     return (name, "views", "accuracy"), rows
 
 
 def comparison_tables(report: Report, missing: str = "–") -> list[tuple[str, Row, Rows]]:
-    """Return title, header and rows of each table that has no picture."""
+    """Return title, header and rows of the tables of fused views and of baselines, if any.
+
+    ``missing`` stands for an undefined metric.
+    """
     text = partial(figure_text, missing=missing)
     tables: list[tuple[str, Row, Rows]] = []
     if report.fused:

@@ -12,9 +12,9 @@ _SAMPLES = 4096
 def shape_functions(points: F4, rng: np.random.Generator) -> F4:
     """Return scale-invariant shape distributions (96,) of points (n, 3).
 
-    These are three histograms, each with sum 1: the distance between two random points (D2), the
-    root of the area of a triangle of three points (D3), both up to 3 times their mean, and the
-    angle at one of three points (A3).
+    These are three histograms of random samples: the distance between two points (D2), the root of
+    the area of a triangle of three points (D3), and the angle at one of three points (A3). Each bin
+    is a fraction of all samples. Distances and roots beyond 3 times their mean are in no bin.
 
     Sources: Osada et al. 2002 for D2; Wohlkinger and Vincze 2011 for the ensemble (ESF); differs:
     lines between points are not classified as inside, outside or mixed.

@@ -147,7 +147,7 @@ def fit_views(
 
 
 def split_instances(labels: np.ndarray, instances: np.ndarray, rng: np.random.Generator) -> Bool:
-    """Return the mask (n,) of held-out views: all views of a fifth of each label's instances.
+    """Return the mask (n,) of views to hold out: all views of a fifth of each label's instances.
 
     At least one instance of each label is held out and at least one is kept; a label with a single
     instance keeps it.
@@ -163,9 +163,9 @@ def split_instances(labels: np.ndarray, instances: np.ndarray, rng: np.random.Ge
 def _describe_folder(
     root: Path, seed: int, observe: Observer, known: tuple[str, ...] = ()
 ) -> tuple[DescribedViews, list[str]]:
-    """Describe a data set from which a model that has ``known`` categories will learn.
+    """Describe a data set from which a model with the ``known`` categories will learn.
 
-    Return the described views, and the categories without any.
+    Return the described views, and the categories that have none.
     """
     dataset = read_dataset(root)
     require_category_names(root, dataset.categories, known)

@@ -18,11 +18,11 @@ __all__ = ["DescribedViews", "describe_view", "describe_views"]
 
 _NOT_ASKED = np.zeros(0)
 _NEAR_SUPPORT_M = 0.05
-"""Largest distance of an object's lowest point from its support; below it may be occluded."""
+"""Maximum distance from z = 0 of the lowest visible point of an object that stands there."""
 
 
 class DescribedViews(NamedTuple):
-    """Described views, with the quantities for the breakdowns.
+    """Described views, and the quantities by which a report breaks them down.
 
     Attributes
     ----------
@@ -34,8 +34,8 @@ class DescribedViews(NamedTuple):
     elevations : (n,) elevation of the sensor as seen from the object, degrees; may be empty.
     functions : (n, f) shape distributions from `shapecat.evaluation.shape_functions`; may
         be empty.
-    off_support : categories of which most views, also skipped ones, have their lowest point farther
-        than `_NEAR_SUPPORT_M` from z = 0, so that they are probably in another frame.
+    off_support : categories of which most views, including skipped ones, have their lowest point
+        farther than `_NEAR_SUPPORT_M` from z = 0: probably, their points are in another frame.
     """
 
     descriptors: F4
@@ -85,7 +85,7 @@ def describe_views(
     observe: Observer = ignore,
     with_functions: bool = False,
 ) -> DescribedViews:
-    """Describe each view; the random numbers of view k, from 1, have the seed (settings.seed, k).
+    """Describe each view; the generator of view k, counted from 1, has the seed (settings.seed, k).
 
     Parameters
     ----------

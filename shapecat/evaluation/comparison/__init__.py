@@ -1,4 +1,4 @@
-"""Comparison of a run's labels with another run or with other labels."""
+"""Comparison of a run's labels with ground truth, labels of other tools, or another run."""
 
 from shapecat.evaluation.comparison.comparing import Comparison, compare
 

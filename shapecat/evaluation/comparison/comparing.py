@@ -43,7 +43,7 @@ __all__ = ["Comparison", "compare"]
 
 _PICTURES = 12
 _DOUBTFUL = 0.1
-"""With a smaller fraction of the objects matched, the reference may be from another recording."""
+"""If a smaller fraction of the objects matches, the reference may be from another recording."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,11 @@ class Comparison:
 
     Attributes
     ----------
-    run, reference : paths of the two.
+    run, reference : their paths.
     kind : kind of the reference, in words.
-    figures : metrics by name, plain values; None if they cannot be computed.
-    rows : all objects of all compared frames.
-    pictures : the frames that differ most, in temporal order.
+    figures : metrics by name, as plain values; None if they cannot be computed.
+    rows : one for each object of each compared frame.
+    pictures : the frames that differ most, in the order of the run.
     notes : remarks for the reader.
     """
 
@@ -156,7 +156,7 @@ def _nothing_in_common(finished: FinishedRun, reference: Path, other: Reference[
 
 
 def _hardly_matches(rows: Sequence[Difference]) -> bool:
-    """Return whether both sides have objects, of which few match."""
+    """Return whether both sides have unmatched objects, but hardly any objects match."""
     found, true = (Counter(row.difference for row in rows)[kind] for kind in ("surplus", "missed"))
     matched = len(rows) - found - true
     return min(found, true) > 0 and matched < _DOUBTFUL * (matched + min(found, true))
@@ -165,7 +165,7 @@ def _hardly_matches(rows: Sequence[Difference]) -> bool:
 def _clouds(
     finished: FinishedRun, recording: Path | None, stack: ExitStack
 ) -> tuple[Iterator[Frame], list[str]]:
-    """Return the frames of the recording; if it is missing, no frames and a note."""
+    """Return the frames of the recording, and no notes; if it is missing, no frames and a note."""
     try:
         source = stack.enter_context(open_source(finished.info, recording))
         options: Options = {**finished.info["options"], "color": ""}
@@ -185,7 +185,10 @@ def _compare_frame(
     clouds: Iterator[Frame],
     part: int,
 ) -> None:
-    """Match the objects of a frame and count agreements and differences."""
+    """Match the objects of a frame, and count agreements and differences in ``tally``.
+
+    Keep a picture of the frame if it differs most of all frames in its ``part`` of the run.
+    """
     frame = next((f for f in clouds if (f.topic, f.index) == key), None)
     _require_same_size(found, true, frame, key)
     found = labelled_part(found, true)
@@ -202,9 +205,9 @@ def _compare_frame(
 
 
 def _require_same_size(found: Labelling, true: Labelling, frame: Frame | None, key: Key) -> None:
-    """Check that the labelled images have the size of the depth image.
+    """Check that the label image has the size of the depth image.
 
-    Without the recording (``frame`` is None), only images that are too small are noticed.
+    Without the recording (``frame`` is None), only a label image that is too small is noticed.
 
     Raises
     ------
@@ -237,7 +240,7 @@ def _differences(
     true: Sequence[LabelledItem],
     matched: Matched,
 ) -> Iterator[Difference]:
-    """Yield the rows of a frame: pairs, missed and surplus objects."""
+    """Yield the rows of a frame: matched pairs and surplus objects, then missed objects."""
     head = (*key, stamp_ns)
     for i, a in enumerate(found):
         if i not in matched.pairs:
@@ -267,7 +270,10 @@ def _differences(
 
 
 def _kind(tally: Tally, a: LabelledItem, b: LabelledItem, f: float | None) -> str | None:
-    """Return the most serious difference of a pair."""
+    """Return the most serious difference of a pair, None if there is none.
+
+    Note its track in ``tally.last_tracks``.
+    """
     switched = False
     if a.track is not None and b.track is not None:
         switched = tally.last_tracks.get(b.track, a.track) != a.track

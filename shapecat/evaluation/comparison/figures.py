@@ -1,4 +1,4 @@
-"""Counts of a comparison over its frames, and the metrics from these counts."""
+"""Counts over the frames of a comparison, and metrics computed from them."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ __all__ = ["Tally", "figures_of"]
 
 
 class Pair(NamedTuple):
-    """A matched pair: its true category, the final one, and category and posterior of the view."""
+    """Categories of a matched pair: the true one, the final one, and that of the view alone."""
 
     truth: str
     label: str
@@ -37,11 +37,11 @@ class Tally:
 
     Attributes
     ----------
-    frames : number of frames.
+    frames : number of compared frames.
     masks : whether all objects of all frames have masks.
     pairs : the matched objects, without ambiguous ones.
-    last_tracks : track that was last matched with each true track.
-    pictures : the frame that differs most in each part of the run, by number.
+    last_tracks : for each true track, the track that was last matched with it.
+    pictures : the frame that differs most in each part of the run, by the number of the part.
     only_run : number of frames that the reference lacks.
     """
 
@@ -76,12 +76,12 @@ class Tally:
 
 
 def figures_of(tally: Tally, categories: Sequence[str], *, tracked: bool) -> dict[str, Any]:
-    """Return all metrics by name, as plain values; None if they cannot be computed.
+    """Return all metrics by name, as plain values; None for those that cannot be computed.
 
     Parameters
     ----------
-    categories : categories of the model; metrics of categories ignore true objects of any other
-        category, such as unknown ones of another run.
+    categories : categories of the model. Metrics of categories ignore true objects of any other
+        category, such as *unknown*.
     tracked : whether the true objects have identities over time.
     """
     overlap = tally.overlap if tally.masks else None

@@ -44,12 +44,12 @@ class Identities(NamedTuple):
 
 
 class _Occurrences(NamedTuple):
-    """Occurrences of the identities.
+    """Occurrences of numbered identities in all frames.
 
     Attributes
     ----------
-    true, found : number of frames with each identity.
-    frames : for each frame, the indices of its identities, and their similarity.
+    true, found : number of frames with each true and each found identity.
+    frames : for each frame, the numbers of its true and found identities, and their similarity.
     """
 
     true: F8
@@ -90,7 +90,7 @@ def compute_tracking_metrics(
 
 
 def _clear_mot(frames: Iterable[FrameIdentities], threshold: float) -> Counter[str]:
-    """Count misses, false positives and switches; a matched pair is kept as long as possible."""
+    """Count misses, false positives and switches; pairs stay matched for as long as possible."""
     last: dict[Hashable, Hashable] = {}
     counts: Counter[str] = Counter()
     for frame in frames:
@@ -108,7 +108,7 @@ def _clear_mot(frames: Iterable[FrameIdentities], threshold: float) -> Counter[s
 def _pairs(
     frame: FrameIdentities, allowed: Bool, last: Mapping[Hashable, Hashable]
 ) -> list[tuple[int, int]]:
-    """Match a frame: first the previous pairs that are still allowed, then the most similar."""
+    """Match a frame: first the previous pairs that are still ``allowed``, then the most similar."""
     true, found, similarity = frame
     place = {name: j for j, name in enumerate(found)}
     pairs: dict[int, int] = {}
@@ -141,7 +141,7 @@ def _occurrences(frames: Iterable[FrameIdentities]) -> _Occurrences:
 
 
 def _idf1(occurrences: _Occurrences, threshold: float) -> float:
-    """Return IDF1, the F1 of the best one-to-one assignment of tracks to objects."""
+    """Return IDF1, the F1 score of the best one-to-one assignment of found to true identities."""
     together = np.zeros((occurrences.true.size, occurrences.found.size))
     for true, found, similarity in occurrences.frames:
         together[np.ix_(true, found)] += similarity >= threshold
@@ -178,9 +178,9 @@ def _count_matches(
 
     Parameters
     ----------
-    pairs : for each frame, index of the true identity times ``found_count``, plus index of the
-        found one.
-    similar : for each frame, the similarity of each pair.
+    pairs : for each frame, its matched pairs (p,), as the number of the true identity times
+        ``found_count``, plus the number of the found one.
+    similar : for each frame, the similarity (p,) of these pairs.
 
     Returns
     -------
@@ -197,7 +197,7 @@ def _count_matches(
 
 
 def _alignment(occurrences: _Occurrences) -> F8:
-    """Return the fraction of two identities' frames in which they coincide, (true, found)."""
+    """Return the fraction of the frames of two identities in which they coincide, (true, found)."""
     together = np.zeros((occurrences.true.size, occurrences.found.size))
     for true, found, similarity in occurrences.frames:
         beside = similarity.sum(axis=0) + similarity.sum(axis=1)[:, None] - similarity

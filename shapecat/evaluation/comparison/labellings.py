@@ -29,10 +29,10 @@ __all__ = [
 ]
 
 UNREADABLE = (*MALFORMED, OSError, RecursionError)
-"""Errors of reading a text file, and of using values in it that are absurd or of other types."""
+"""Errors of reading a text file, and of using values from it that have wrong types or ranges."""
 _Frame = TypeVar("_Frame")
 Place = tuple[str | None, int, int | None]
-"""Topic, None for any; timestamp (ns) or frame number; and the frame number in addition to a
+"""Topic, None for any; timestamp (ns) or else frame number; and the frame number that goes with a
 timestamp, None if unknown."""
 
 
@@ -45,9 +45,9 @@ class LabelledItem:
     track : number of its track; None if it has none.
     pixels : (n,) flat indices into the frame; None if there is no mask.
     box : 3D box in the sensor frame; None if there is none.
-    decidable : whether its category is unambiguous in this view.
+    decidable : whether its category is unambiguous in this frame.
     confidence : confidence of the final label; only in runs.
-    view_category, posterior : category and posterior (c,) of the single view; only in runs.
+    view_category, posterior : category and posterior (c,) from this frame alone; only in runs.
     """
 
     track: int | None
@@ -97,8 +97,8 @@ class Reference(ABC, Generic[_Frame]):
 
     Parameters
     ----------
-    path : of the reference, for messages.
-    frames : entries of the frames, as for `index_frames`.
+    path : path of the reference, for messages.
+    frames : places and entries of the frames, as for `index_frames`.
 
     Raises
     ------
@@ -108,7 +108,7 @@ class Reference(ABC, Generic[_Frame]):
     kind: str
     """Kind of the reference, in words."""
     unit = "frames"
-    """Plural noun for the timestamps or numbers that identify frames, for messages."""
+    """Plural noun for what identifies frames, for messages."""
     tracked: bool = False
     """Whether objects have identities over time."""
     numbered: bool = False
@@ -145,9 +145,9 @@ class Reference(ABC, Generic[_Frame]):
 
 
 def numbering_notes(other: Reference[Any], start_s: float | None) -> list[str]:
-    """Return a note if frame 0 of the run may not be frame 0 of the reference.
+    """Return a list with a note if frames may be numbered differently in run and reference.
 
-    ``start_s`` is where the run began in its recording, None for the beginning.
+    ``start_s`` is the start of the run in its recording, None for the beginning.
     """
     if not (other.numbered and start_s):
         return []
@@ -160,13 +160,13 @@ def numbering_notes(other: Reference[Any], start_s: float | None) -> list[str]:
 
 
 def index_frames(path: Path, frames: Iterable[tuple[Place, _Frame]]) -> dict[Place, _Frame]:
-    """Return entries as `find_frame` needs them.
+    """Return the index of entries that `find_frame` needs.
 
-    Frames of a topic with equal timestamps are found only together with their numbers.
+    If frames of a topic have equal timestamps, their entries are found only with their numbers.
 
     Parameters
     ----------
-    path : of the reference, for the message.
+    path : path of the reference, for the message.
     frames : pairs of a place and an entry. A place is the topic (None for any), the timestamp (ns)
         or else the frame number, and the frame number beside a timestamp (None if unknown).
 
@@ -195,6 +195,7 @@ def find_frame(
     Parameters
     ----------
     index : from `index_frames`.
+    key : topic and number of the frame.
     repeated : whether other frames of its topic have the same timestamp.
     """
     number = key[1]

@@ -25,8 +25,8 @@ __all__ = [
 SAME_MASK = 0.5
 """Lowest IoU of two masks that count as the same object (PASCAL VOC)."""
 SAME_BOX = 0.25
-"""Lowest IoU of two 3D boxes that count as the same object; less than for masks, as hidden sides
-are estimates (SUN RGB-D, Song 2015)."""
+"""Lowest IoU of two 3D boxes that count as the same object. It is lower than for masks, because
+hidden sides are estimates (SUN RGB-D, Song 2015)."""
 
 
 class Difference(NamedTuple):
@@ -35,7 +35,7 @@ class Difference(NamedTuple):
     Attributes
     ----------
     difference : ``missed``, ``surplus``, ``outline`` (``f`` below 0.75), ``category``, ``identity``
-        (a different track from before), or None if both agree.
+        (another track than in earlier frames), or None if both agree.
     true_track, true_category : from the reference; None without a true object.
     track, category, confidence : from the run; None without a detection.
     f, iou : overlap of the masks; None without masks.
@@ -88,7 +88,10 @@ def item_box_iou(a: LabelledItem, b: LabelledItem) -> float | None:
 def frame_identities(
     found: Sequence[LabelledItem], true: Sequence[LabelledItem], matched: Matched
 ) -> FrameIdentities:
-    """Return the identities of a frame; a track with several detections keeps the most similar."""
+    """Return the identities of a frame, without duplicates, and their similarity.
+
+    Of several detections of one track, the one most similar to a true object counts.
+    """
     best: dict[int, int] = {}
     for i, item in enumerate(found):
         if item.track is None:
@@ -104,7 +107,7 @@ def frame_identities(
 def labelled_part(found: Labelling, true: Labelling) -> Labelling:
     """Return the detections without the pixels that have no label in the truth.
 
-    Detections of which more than half is ignored in the truth are left out.
+    A detection with more than half of its pixels ignored in the truth is left out.
     """
     if true.known is None:
         return found

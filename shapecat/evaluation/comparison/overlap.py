@@ -21,7 +21,7 @@ MATCHED_F = 0.75
 
 @dataclass(frozen=True)
 class Overlap:
-    """Pixels and objects counted over frames; overlaps can be added.
+    """Counts of pixels and objects over one or more frames; they can be added.
 
     Attributes
     ----------
@@ -81,7 +81,9 @@ class Matched(NamedTuple):
 
 
 def match_masks(found: Sequence[U4], true: Sequence[U4]) -> Matched:
-    """Match found and true masks, flat pixel indices (n,), maximising the sum of overlap F.
+    """Match found and true masks one to one, maximising the sum of overlap F.
+
+    Each mask is the flat indices (n,) of its pixels.
 
     Source: Xie et al. 2020 (overlap F of unseen objects), after Ochs et al. 2014.
     """
@@ -137,7 +139,7 @@ def box_iou(a: Box, b: Box) -> float:
 
 
 def _inside(a: Box, b: Box) -> F8:
-    """Return the end points (n, 3) of the parts of the edges of ``a`` that lie inside ``b``."""
+    """Return the end points (n, 3) of the edges of ``a``, after clipping the edges to ``b``."""
     turn = rotation_from_quaternion(b.orientation)
     corners = (box_corners(a) - b.center) @ turn
     half = b.size.astype(np.float64) / 2

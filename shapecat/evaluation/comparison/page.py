@@ -1,4 +1,4 @@
-"""Output of a comparison: metrics, a page with pictures, and a table of all objects."""
+"""Outputs of a comparison: metrics, a page with pictures, and a table of all objects."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -32,9 +32,9 @@ __all__ = [
 
 _MOST_ROWS = 500
 _LETTERS = 43
-"""Width of a picture divided by the height of its letters, whatever its number of pixels."""
+"""Width of a picture divided by the height of its letters."""
 _LETTER_WIDTH, _LINE = 0.62, 1.15
-"""Mean width of a letter, and distance of two lines, relative to the height of a letter."""
+"""Mean width of a letter, and distance between lines, relative to the height of a letter."""
 
 OBJECTS = pa.schema(
     [
@@ -58,7 +58,7 @@ def require_new(folder: Path) -> None:
 
     Raises
     ------
-    OutputError : the folder is not empty, has no name that Arrow can write, or cannot be created.
+    OutputError : the folder is not empty, has no valid name, or cannot be created.
     """
     partial_path(folder)  # raises if it has no name
     require_utf8(folder)
@@ -193,7 +193,7 @@ _HEAD = ("frame", "difference", "true", "found", "track", "confidence", "overlap
 
 
 def _confidence(row: Difference) -> str:
-    """Return the confidence as in captions, which omit it for an unknown object."""
+    """Return the confidence as text, which is empty for an unknown object, as in captions."""
     if row.confidence is None or row.category == UNKNOWN:
         return ""
     return confidence_text(row.confidence)
@@ -236,12 +236,12 @@ def _picture(picture: DifferenceImage) -> str:
 def place_captions(
     captions: Iterable[Caption], letter: float, width: int
 ) -> list[tuple[float, float, str]]:
-    """Return middle, base line and text of each caption; move captions down that would overlap.
+    """Return middle x, baseline y and text of each caption; move down those that would overlap.
 
     Parameters
     ----------
     letter : height of the letters, pixels.
-    width : of the picture, pixels.
+    width : width of the picture, pixels.
     """
     placed: list[tuple[float, float, str]] = []
     for caption in sorted(captions, key=lambda caption: caption.y):

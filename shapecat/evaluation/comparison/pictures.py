@@ -22,8 +22,8 @@ COLOURS = {
     "surplus": (30, 100, 220),
     "category": (160, 40, 170),
 }
-"""Colours of the pixels: run and truth agree, only in the truth, only in the run, and same object
-but different category."""
+"""Colours of pixels: on which run and truth agree, only in the truth, only in the run, and in both
+but with different categories."""
 _INK = 0.55
 
 
@@ -36,9 +36,9 @@ class Caption(NamedTuple):
 
 
 class DifferenceImage(NamedTuple):
-    """A picture of a frame: a PNG as a data URI, with captions and the differences it shows.
+    """A picture of a frame: a PNG image as a data URI, with captions.
 
-    ``severity`` grows with the number of differences.
+    ``rows`` are the differences that it shows; ``severity`` grows with their number.
     """
 
     topic: str
@@ -66,8 +66,9 @@ def draw_frame(
     ----------
     frame : the depth frame; None for a plain background.
     pairs : index of the true object for each matched found object.
-    rows : differences of the frame: first of the found objects, then of the missed ones, both in
-        their order.
+    rows : rows of the frame: first those of the found objects, then those of the missed ones, both
+        in the order of the objects.
+    severity : value of this field of the picture.
 
     Returns
     -------
@@ -96,10 +97,10 @@ def _states(
     rows: Sequence[Difference],
     size: int,
 ) -> U1:
-    """Return the colour number of each pixel, (n,), from 1; 0 without an object.
+    """Return the colour of each pixel, (n,): 0 without an object, else 1 + its place in `COLOURS`.
 
-    If a found object lies on a true one that it is not matched with, its pixels count as surplus,
-    so that split objects are visible.
+    Where a found object covers a true one that it does not match, its pixels count as surplus, so
+    that split objects are visible.
     """
     state = np.zeros(size, np.int64)
     for number, labelling in ((2, true), (3, found)):
@@ -116,7 +117,7 @@ def _states(
 
 
 def _shades(frame: Frame | None, height: int, width: int) -> U1:
-    """Return the grey level of each pixel, (n,), shaded from the camera; nearer is brighter."""
+    """Return the grey level (n,) of each pixel, as if lit from the camera; nearer is brighter."""
     if frame is None or frame.depth is None:
         return np.full(height * width, _SHADES * 3 // 4)
     depth = np.asarray(frame.depth, np.float64)

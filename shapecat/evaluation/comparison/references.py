@@ -55,8 +55,8 @@ def open_reference(
     path : a run folder; a KITTI folder, which has a folder ``label_2``; a JSON file of `shapecat
         simulate` or COCO; or a simulated recording with its ground truth beside it.
     categories : categories of the run to compare; they tell which ``_`` in a KITTI type are spaces.
-    run, digest : name of the run to compare, and digest of its recording; they select the images if
-        the reference has several recordings.
+    run, digest : name of the run to compare, and digest of its recording; they select the images of
+        a COCO file that has several recordings.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def open_reference(
 class SimulatedTruth(Reference[dict[str, Any]]):
     """Ground truth of `shapecat simulate`: NAME.truth.json and NAME.labels.npz.
 
-    Objects of which too few pixels are visible are ignored.
+    Its ``hidden`` objects, with too few visible pixels, count neither as missed nor as false.
     """
 
     kind, unit = "ground truth of each pixel", "stamps"
@@ -136,7 +136,7 @@ def _true_labelling(entry: Mapping[str, Any], image: U1) -> Labelling:
 
 
 class _LabelImages:
-    """The array ``labels`` (t, h, w), uint8, of an .npz, read image by image, forward only."""
+    """The label images (h, w), uint8, of a simulated recording, read one by one in order."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -150,7 +150,7 @@ class _LabelImages:
             raise RecordingError(msg) from error
 
     def read(self, index: int) -> U1:
-        """Return an image (h, w); afterwards, earlier images cannot be read any more.
+        """Return an image (h, w); afterwards, no earlier image can be read.
 
         Raises
         ------
@@ -218,7 +218,7 @@ class OtherRun(Reference[Key]):
 
 
 def repeated_stamps(folder: Path) -> set[tuple[str, int]]:
-    """Return the topics and timestamps (ns) that several frames of a run have."""
+    """Return each topic and timestamp (ns) that several frames of a run share."""
     counts = Counter((topic, stamp) for (topic, _), stamp in read_stamps(folder))
     return {place for place, count in counts.items() if count > 1}
 
@@ -240,9 +240,9 @@ def read_complete(folder: Path) -> FinishedRun:
 def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, Any], Labelling]]:
     """Yield the frames of a run in order: topic and number, the frame's table row, its objects.
 
-    Detections without a track keep the category of the single view, detections of deleted tracks
-    are left out, and detections of merged tracks in one frame are joined. Boxes are full boxes if
-    these are known, else visible ones.
+    A detection without a track keeps its own category. Detections of deleted tracks are left out;
+    those of merged tracks are joined if they are in the same frame. Boxes are full boxes if these
+    are known, else visible ones.
     """
     folder = finished.folder
     deleted = _deleted(folder, finished.labels)
@@ -270,7 +270,7 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
 
 
 def _deleted(folder: Path, labels: Container[int]) -> set[tuple[str, int, int]]:
-    """Return topic, frame and detection of each detection whose track a person has deleted."""
+    """Return topic, frame and number of each detection whose track a person has deleted."""
     names = ("topic", "frame", "detection", "track")
     deleted = set()
     for group in read_row_groups(folder / "tracks.parquet", names):
@@ -285,7 +285,10 @@ def _item(
     full: Sequence[Box | None],
     up: Sequence[float],
 ) -> LabelledItem:
-    """Join detections to one object; the largest gives the category of the single view."""
+    """Join detections to one object.
+
+    ``label`` is its track, category and confidence. The largest detection gives ``view_category``.
+    """
     track, category, confidence = label
     boxes = [
         whole or Box(row["center"], row["size"], row["orientation"])

@@ -23,8 +23,8 @@ __all__ = ["CocoLabels", "filled_polygon"]
 
 _MOST_PIXELS = 50_000_000
 _A_STAMP = 10**17
-"""Larger numbers in image names are timestamps in nanoseconds, smaller ones frame numbers or dates,
-of which the longest, with milliseconds, have 17 digits."""
+"""A larger number in an image name is a timestamp in nanoseconds; a smaller one is a frame number
+or a date. The longest dates, with milliseconds, have 17 digits."""
 
 
 class _Annotation(NamedTuple):
@@ -49,9 +49,9 @@ class CocoLabels(Reference[_Image]):
 
     An image names its frame by ``stamp_ns`` (with ``frame`` where stamps repeat), by ``frame``, or
     by a number in its ``file_name``: a timestamp in nanoseconds, else the last number, which is
-    the frame number. An image without ``topic`` matches any topic. If several recordings are named
-    by ``recording``, the images of the one with the name of the ``run`` are used; of those with
-    equal names, the one with the ``digest`` of its recording.
+    the frame number. An image without ``topic`` matches any topic. If the images are of several
+    recordings, only those whose ``recording`` is the name of the ``run`` are used. If some of these
+    have the ``digest`` of the run's recording, only they are used.
     """
 
     kind, unit = "COCO labels", "images"
@@ -112,11 +112,11 @@ def _track_of(item: Mapping[str, Any]) -> int | None:
 def _images_of(
     run: str, path: Path, images: Sequence[Mapping[str, Any]]
 ) -> Sequence[Mapping[str, Any]]:
-    """Return the images of a run's recording; all images if they name only one, or none.
+    """Return the images of a run's recording; all images if they name one recording or none.
 
     Raises
     ------
-    RecordingError : there are several recordings, none of which has the name of the run.
+    RecordingError : they name several recordings, none of which has the name of the run.
     """
     names = {str(image["recording"]) for image in images if "recording" in image}
     if len(names) < 2:
@@ -141,7 +141,7 @@ def _is_numbered(image: Mapping[str, Any]) -> bool:
 
 
 def _number_in_name(image: Mapping[str, Any]) -> int:
-    """Return the timestamp in the name of an image, ns, or the frame number."""
+    """Return the timestamp (ns), or else the frame number, in the file name of an image."""
     digits = re.findall(r"\d+", Path(image["file_name"]).stem)
     if not digits:
         msg = f"the name {image['file_name']!r} holds neither a timestamp nor a frame number"

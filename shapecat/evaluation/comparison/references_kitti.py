@@ -30,11 +30,11 @@ class KittiLabels(Reference[str]):
     ``frames.csv`` gives the timestamp of each label file, its frame number where timestamps
     repeat, and its topic where there are several; without it, the file's number is the frame
     number. Boxes are in the rectified camera frame; the row ``Tr_rect_to_sensor`` of the
-    calibration turns them into the sensor frame. Without it, as in KITTI's own data, the frames
-    are the same.
+    calibration turns them into the sensor frame. Without this row, as in KITTI's own data, the two
+    frames are taken to be the same.
 
-    A type cannot hold spaces. It stands for the first of ``categories`` that is written this way;
-    in any other type, each ``_`` is a space.
+    A type cannot hold spaces. It stands for the first of ``categories`` that is written in this
+    way; in a type that stands for none, each ``_`` is a space.
     """
 
     kind = "KITTI labels"
@@ -74,7 +74,7 @@ class KittiLabels(Reference[str]):
 
 
 def _listed(path: Path) -> list[tuple[Place, str]]:
-    """Return the frame and the name of each label file; empty without ``frames.csv``.
+    """Return the frame and the name of each label file; none without ``frames.csv``.
 
     Labels of a single topic match any topic, since the recording may use another name.
     """
@@ -92,7 +92,7 @@ def _place(row: Mapping[str, str], *, several: bool) -> Place:
 
 
 def _sensor_from_rectified(path: Path) -> F8:
-    """Return the rotation (3, 3) from a calibration file; the identity if it has none."""
+    """Return the rotation (3, 3) from a calibration file; the identity if it does not state one."""
     text = path.read_text("utf-8") if path.is_file() else ""
     lines = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
     transform = lines.get("Tr_rect_to_sensor", "1 0 0 0 0 1 0 0 0 0 1 0")
@@ -100,7 +100,11 @@ def _sensor_from_rectified(path: Path) -> F8:
 
 
 def _box(words: list[str], turn: F8) -> Box:
-    """Return the box of a line: type truncated occluded alpha bbox h w l x y z rotation_y."""
+    """Return the box of a label, in the sensor frame.
+
+    The words of its line are type truncated occluded alpha bbox(4) h w l x y z rotation_y; ``turn``
+    is from `_sensor_from_rectified`.
+    """
     height, width, length, x, y, z, yaw = map(float, words[8:15])
     c, s = math.cos(yaw), math.sin(yaw)
     axes = np.array([[c, s, 0.0], [0.0, 0.0, -1.0], [-s, c, 0.0]])  # columns: along, across, up
