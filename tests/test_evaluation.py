@@ -792,7 +792,7 @@ def test_training_views_of_cross_validation_are_mean_over_folds(
     def chain(_: Any, test: DescribedViews, __: Any) -> np.ndarray:
         return np.full((len(test.labels), 2), 0.5)
 
-    monkeypatch.setattr(baselines, "_chain", chain)
+    monkeypatch.setattr(baselines, "_learn_shapecat", chain)
     learners = {"shapecat": chain, "plain": partial(chain)}
     monkeypatch.setattr(baselines, "_learners", lambda: learners)
     rows = baselines.compare_learners(views, None, categories=("cup", "can"), root=Path("data"))

@@ -41,8 +41,8 @@ def compare_learners(
     ----------
     test : test views; those labelled ``unknown`` are left out.
     train : training views. If None, use ``test`` in cross-validation by instance, in up to 5 folds.
-    categories : order of the posteriors. A category without training
-        views counts as wrong.
+    categories : order of the posteriors. All views of a category without training views count as
+        wrong.
     root : folder of the data set, which error messages name.
 
     Returns
@@ -66,7 +66,7 @@ def compare_learners(
     rows = []
     for k, (name, learner) in enumerate(learners.items(), start=1):
         truth, posteriors = _predict_all(learner, splits, categories)
-        learned = _mean_views(splits, with_unknown=learner is _chain)
+        learned = _mean_views(splits, with_unknown=learner is _learn_shapecat)
         rows.append(_compared(name, learned, truth, posteriors))
         observe("baselines", k, len(learners))
     return tuple(rows)
@@ -86,7 +86,7 @@ def _folds(views: DescribedViews) -> Iterator[tuple[DescribedViews, DescribedVie
 
 
 def _mean_views(splits: list[tuple[DescribedViews, DescribedViews]], *, with_unknown: bool) -> int:
-    """Return the mean number of training views over the splits."""
+    """Return the mean number of training views over the splits, with or without unknown shapes."""
     counts = [np.sum(with_unknown | (train.labels != UNKNOWN)) for train, _ in splits]
     return round(float(np.mean(counts)))
 
@@ -137,20 +137,20 @@ def _learners() -> dict[str, _Learner]:
 
     makers = make_baselines(tuple(BLOCKS.values()))
     descriptors, functions = attrgetter("descriptors"), attrgetter("functions")
-    learners: dict[str, _Learner] = {"shapecat": _chain}
-    learners |= {name: _plain(make, descriptors) for name, make in makers.items()}
-    learners["forest on D2"] = _plain(makers["forest"], _d2)
-    learners["forest on D2, D3, A3 (ESF-like)"] = _plain(makers["forest"], functions)
+    learners: dict[str, _Learner] = {"shapecat": _learn_shapecat}
+    learners |= {name: _make_learner(make, descriptors) for name, make in makers.items()}
+    learners["forest on D2"] = _make_learner(makers["forest"], _d2)
+    learners["forest on D2, D3, A3 (ESF-like)"] = _make_learner(makers["forest"], functions)
     return learners
 
 
-def _chain(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
+def _learn_shapecat(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
     """Train and test shapecat's classifier; unlike the baselines, it also learns unknown shapes."""
     model = fit_views(train, train.where(np.zeros(0, np.int64)), seed=0)
     return _in_order(model.predict(test.descriptors).posteriors, model.categories, categories)
 
 
-def _plain(make: Callable[[], Any], features: Callable[[DescribedViews], F4]) -> _Learner:
+def _make_learner(make: Callable[[], Any], features: Callable[[DescribedViews], F4]) -> _Learner:
     """Return a learner: a scikit-learn classifier on features, trained without unknown shapes."""
 
     def learn(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
@@ -162,7 +162,10 @@ def _plain(make: Callable[[], Any], features: Callable[[DescribedViews], F4]) ->
 
 
 def _in_order(posteriors: F4, found: Any, categories: tuple[str, ...]) -> F8:
-    """Return columns, named ``found``, in the order of ``categories``; 0 for missing ones."""
+    """Return posteriors with their columns in the order of ``categories``.
+
+    ``found`` are the categories of the given columns; the posterior of any other is 0.
+    """
     names = [str(name) for name in found]
     result = np.zeros((len(posteriors), len(categories)))
     for column, name in enumerate(categories):

@@ -136,7 +136,7 @@ def _figures(report: Report) -> Rows:
 
 
 def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> str:
-    """Return a confusion matrix ``table`` (c, c) as SVG, shaded by the fraction of each row."""
+    """Return a confusion matrix ``table`` (c, c) as SVG; shades are fractions of the rows."""
     margin = max(_MARGIN, 16 + _LETTER * max(map(len, categories), default=0))
     size = margin + _CELL * len(categories)
     parts: list[str] = []

@@ -17,7 +17,7 @@ from shapecat.learning.known_views import KNOWN_VIEWS, choose_evenly
 __all__ = ["add_categories"]
 
 _L2 = 1e-2
-"""Strength of the L2 regularisation, per view."""
+"""Strength of the L2 regularisation; the loss is a mean over the views."""
 _FOLDS = 4
 _STEPS = 150
 """Maximum number of iterations of the minimiser if it starts from zero weights."""

@@ -101,8 +101,8 @@ def _write_member(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
 def load_model(path: Path | None = None) -> Categorizer:
     """Read a model; without a path, read the default model that comes with the package.
 
-    No file can run code, or crash or hang the reader: the size of the file bounds all sizes, and
-    every index is checked.
+    No file can run code, or crash or hang the reader: sizes are limited, and every index is
+    checked.
 
     Raises
     ------

@@ -31,7 +31,7 @@ class Growth(NamedTuple):
 
 
 def growing_options(out: Path) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add the options that the commands for training share; ``out`` is the default for --out."""
+    """Return a decorator that adds the common options of training; --out defaults to ``out``."""
     where = f"{'File' if out.suffix else 'Folder'} to write to; by default that of shapecat."
     options = (
         click.option("--seed", default=0, show_default=True, help="Seed of the random generator."),

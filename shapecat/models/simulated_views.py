@@ -49,7 +49,7 @@ _THIN_M = 0.03
 category: a cupboard is a box."""
 _HEIGHT = DESCRIPTOR_NAMES.index("metric.height")
 _DETECTED = 0.75
-"""Fraction of the detected objects segmented by detection; the others, by the truth."""
+"""Fraction of the detected objects that detection segments; the truth segments the others."""
 _FRAGMENTS = 0.3
 """Fraction of the views from which a partial view is cut, too."""
 _SETTINGS = Settings()
@@ -215,7 +215,10 @@ def _views_of(
 
 
 def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> list[SimulatedView]:
-    """Return views of the thin detections that show none of the ``objects`` objects."""
+    """Return views of the thin detections that show no object.
+
+    ``objects`` is the number of objects, whose mesh ids come first.
+    """
     mesh_ids = image.mesh_ids.reshape(-1)
     views = []
     for candidate in scene.candidates:

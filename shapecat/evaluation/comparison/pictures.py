@@ -68,7 +68,7 @@ def draw_frame(
     pairs : index of the true object for each matched found object.
     rows : rows of the frame: first those of the found objects, then those of the missed ones, both
         in the order of the objects.
-    severity : value of this field of the picture.
+    severity : `DifferenceImage.severity` of the picture.
 
     Returns
     -------

@@ -33,8 +33,8 @@ class KittiLabels(Reference[str]):
     calibration turns them into the sensor frame. Without this row, as in KITTI's own data, the two
     frames are taken to be the same.
 
-    A type cannot hold spaces. It stands for the first of ``categories`` that is written in this
-    way; in a type that stands for none, each ``_`` is a space.
+    A KITTI type cannot hold spaces, which are written as ``_``. A type stands for the first of
+    ``categories`` that is written like it; if there is none, each ``_`` is read as a space.
     """
 
     kind = "KITTI labels"

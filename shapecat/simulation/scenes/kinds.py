@@ -44,7 +44,7 @@ class _SceneSpec:
     categories: tuple[str, ...]
 
     def draw(self, rng: Generator, count: int, *, unknown: int = 0) -> list[str]:
-        """Draw ``count`` categories; add ``unknown`` times the category ``unknown``.
+        """Draw the categories of ``count`` objects; append those of ``unknown`` unknown objects.
 
         No category repeats before all have appeared.
         """
