@@ -25,7 +25,7 @@ _CLIP = 8.0
 
 
 def make_baselines(blocks: Sequence[slice]) -> dict[str, Callable[[], Any]]:
-    """Return functions that make unfitted baselines, by name; all classify whole descriptors.
+    """Return, by name, functions that make untrained classifiers of descriptors.
 
     ``forest`` is a random forest; ``linear`` is logistic regression on the standardised descriptor;
     ``pnn`` multiplies the Parzen densities of the blocks; ``forest leaves (thesis)`` are
@@ -58,7 +58,7 @@ class Densities:
     x : (n, d) descriptors.
     y : (n,) categories.
     blocks : range of each block in the descriptor.
-    kernels : Gaussians per category, around views drawn at random.
+    kernels : maximum number of Gaussians per category; each is centred on a view drawn at random.
 
     Notes
     -----
@@ -106,7 +106,10 @@ class Densities:
         return found if found.size else np.zeros(1)  # each category has a single view
 
     def _fit_width(self, views: Sequence[F8], block: slice) -> float:
-        """Return the bandwidth with the highest likelihood of views (n, d) of each category."""
+        """Return the bandwidth of a block that maximises the likelihood of ``views``.
+
+        ``views`` holds the standardised descriptors (n, d) of each category.
+        """
         nearest = []
         for kernels in self._kernels:
             distances = cdist(kernels[:, block], kernels[:, block])
@@ -125,8 +128,8 @@ class Densities:
 def _log_density(z: F8, kernels: F8, width: float) -> F8:
     """Return the log (n,) of the mean Gaussian around kernels (k, d) at views (n, d).
 
-    The factor that is the same for every category is left out. A kernel at a view does not count,
-    since it is probably this view itself, which would make the densities of training views too
+    The factor that is the same for every category is left out. A kernel that coincides with a view
+    does not count: it probably is that view, and would make the densities of training views too
     high. The result is -inf if no kernel counts.
     """
     squared = cdist(z, kernels, "sqeuclidean")
@@ -136,7 +139,7 @@ def _log_density(z: F8, kernels: F8, width: float) -> F8:
 
 
 class _DensityProduct:
-    """A probabilistic neural network as a classifier: the product of the blocks' densities."""
+    """A probabilistic neural network, which classifies by the product of the blocks' densities."""
 
     def __init__(self, blocks: Sequence[slice]) -> None:
         self._blocks = blocks

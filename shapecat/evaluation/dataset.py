@@ -36,7 +36,7 @@ DAMAGED = (
     zlib.error,
     lzma.LZMAError,
 )
-"""Errors of NumPy for damaged .npz files."""
+"""Errors that NumPy raises for damaged .npz files."""
 
 
 class View(Record):
@@ -96,7 +96,7 @@ def read_dataset(root: Path) -> Dataset:
 
 
 def _views_among(root: Path, pattern: str) -> list[Path]:
-    """Return the paths of the views below a folder, by suffix, sorted, without hidden ones."""
+    """Return the sorted paths of the views below a folder; hidden ones are left out."""
     return sorted(
         path
         for path in root.glob(pattern)

@@ -136,7 +136,10 @@ def _figures(report: Report) -> Rows:
 
 
 def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> str:
-    """Return a confusion matrix ``table`` (c, c) as SVG; shades are fractions of the rows."""
+    """Return a confusion matrix ``table`` (c, c) as SVG.
+
+    The shade of a cell shows its count as a fraction of its row.
+    """
     margin = max(_MARGIN, 16 + _LETTER * max(map(len, categories), default=0))
     size = margin + _CELL * len(categories)
     parts: list[str] = []
@@ -229,7 +232,7 @@ def _svg(width: float, height: float, parts: Sequence[str]) -> str:
 
 
 def _shade(share: float) -> str:
-    """Return a CSS colour from white for 0 to the ink for 1."""
+    """Return a CSS colour between white, for 0, and the colour of the ink, for 1."""
     return "rgb" + str(tuple(round(255 + (ink - 255) * share) for ink in _INK))
 
 

@@ -76,7 +76,7 @@ class Report:
         1) and ``auroc``; None without unknown shapes.
     rejected_known : fraction of the known shapes with a novelty above 1.
     skipped : number of views with too few points for a surface.
-    off_support : categories of which most views do not stand at z = 0.
+    off_support : categories whose objects, in most views, do not stand at z = 0.
     by_distance, by_points, by_elevation : (range, views, accuracy) over the distance in metres, the
         number of voxels, and the elevation of the sensor in degrees.
     fused : accuracy after fusing several views; empty if no object has three views.

@@ -46,9 +46,9 @@ def train_on_folder(
     Returns
     -------
     Plain values: ``views``, ``skipped``, ``lost`` (categories of which all views were skipped),
-    ``off_support`` (categories of which most views do not stand at z = 0), ``categories``,
-    ``model`` (its id), ``calibrated`` (whether enough instances were held out to fit the
-    temperature), and ``held_out`` (the report on them).
+    ``off_support`` (categories whose objects, in most views, do not stand at z = 0),
+    ``categories``, ``model`` (its id), ``calibrated`` (whether enough instances were held out to
+    fit the temperature), and ``held_out`` (the report on these instances).
 
     Raises
     ------

@@ -55,7 +55,7 @@ def grow_ensemble(
     Parameters
     ----------
     features : (n, f).
-    labels : (n,) column of each view's logit, from 0.
+    labels : (n,) index of the logit that is true for each view.
     rounds : trees per category.
     leaves : maximum number of leaves per tree.
     rate : learning rate.

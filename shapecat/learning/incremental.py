@@ -22,7 +22,7 @@ _FOLDS = 4
 _STEPS = 150
 """Maximum number of iterations of the minimiser if it starts from zero weights."""
 _FEW_STEPS = 40
-"""Maximum number of iterations in a fold, which starts from the weights fitted on all views."""
+"""Maximum number of iterations if it starts from the weights for all views, as for each fold."""
 _LOST = 0.006
 """Fraction of the correctly categorized known views that new categories may take over."""
 _LARGEST_SHIFT = 2.0
@@ -193,10 +193,11 @@ def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, l2: float, steps: i
 def _shift(
     inputs: _Inputs, old: F8, truth: I4, learned: F8, l2: float, rng: np.random.Generator
 ) -> float:
-    """Return the largest constant for the new logits that takes few views from old categories.
+    """Return the largest constant that can be added to the new logits with little harm.
 
-    Cross-validation counts these views, among those that the old logits categorize correctly. The
-    parameters are as for `_fit_new`; ``learned`` are its weights.
+    With it, the new categories take over at most a fraction `_LOST` of the views that the old
+    logits categorize correctly. The new logits of a view come from a fold without this view. The
+    parameters are as for `_fit_new`; ``learned`` are the weights that it returned for all views.
     """
     fold = rng.permutation(len(truth)) % _FOLDS
     new = np.zeros((len(truth), learned.shape[1]))

@@ -68,8 +68,8 @@ def require_model_path(path: Path, *, overwrite: bool = True) -> None:
 
     Raises
     ------
-    OutputError : it cannot be written, or the file exists and is not a model, or it is a model and
-        ``overwrite`` is false.
+    OutputError : the model cannot be written, or the file exists and is not a model, or it is a
+        model and ``overwrite`` is false.
     """
     require_writable(path)
     with explained(f"{path}: cannot be read", OutputError):

@@ -75,7 +75,7 @@ def fit_categorizer(
     Parameters
     ----------
     train : training views.
-    held_out : views of other instances, which fit the temperature and the novelty threshold.
+    held_out : views of other instances, for fitting the temperature and the novelty threshold.
     descriptor_names : names of the components of the descriptor.
     categories : the categories in the order of the posterior.
 

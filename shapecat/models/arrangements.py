@@ -174,7 +174,7 @@ def _at_rest(
 ) -> ArrangedObject:
     """Put a mesh into a random resting pose; upright if it has no stable pose of that kind.
 
-    ``label`` is its category, which determines the probabilities.
+    ``label`` is its category, on which the probabilities of the poses depend.
     """
     chances = dict(_RESTING_POSES.get(label, {"upright": 1.0}))
     if options.lying is not None and label in _ROUND:

@@ -13,7 +13,7 @@ _FEWEST_POINTS = 60
 _KEPT = (0.3, 0.85)
 """Minimum and maximum fraction of the points that remain."""
 _LOW = 0.3
-"""A fragment contains points within this lowest fraction of the height, near the support."""
+"""A fragment must have points in this lowest fraction of the height, near the support."""
 _TRIES = 8
 
 

@@ -99,7 +99,7 @@ def evaluate_model(
 
 
 def _test_views() -> list[SimulatedView]:
-    """Return the clear views of a few test arrangements, with their points."""
+    """Return the views of a few test arrangements that `clear_views` selects, with their points."""
     options = replace(options_of("test"), keep=True)
     views = [view for number in range(_DRAWN) for view in simulate_arrangement(options, number)]
     return [view for view, clear in zip(views, clear_views(collect(views)), strict=True) if clear]

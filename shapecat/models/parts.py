@@ -80,10 +80,10 @@ _SERIES = (
     Series("bin", 90_000, 350),
     Series("shelf_bin", 94_000, 300),
 )
-"""Seeds below 2000 are for development, seeds from 100000 on for evaluation only. In piles and
-bins, objects lean, lie across each other and touch walls; in rows, similar objects nearly touch.
-Split seeds give more pairs of similar objects; in all scenes, they made the trees merge stacked
-cans."""
+"""Random seeds below 2000 are for development, those from 100000 on for evaluation only. In piles
+and bins, objects lean, lie across each other and touch walls; in rows, similar objects nearly
+touch. With ``split``, there are more pairs of similar objects; but when all scenes were split, the
+trees merged stacked cans."""
 _VIEWS = 4
 """Number of views of each scene, alternately from its path and from anywhere; sensors vary."""
 _OTHERS = (

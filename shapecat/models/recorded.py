@@ -1,9 +1,9 @@
 """Views of real objects from hand-labelled recordings, for evaluation.
 
-A folder holds ``depth.mcap`` and ``truth.json``, with one entry per frame. Each of its ``objects``
-has a ``category`` and either its ``parts``, the numbers of its pixels in the label images of
-``labels.npz`` (one per frame; 1 to 9 are tables), or its ``centroid_m`` and ``extent_m`` in the
-sensor frame.
+A folder holds ``depth.mcap`` and ``truth.json``, a list with one entry per frame. An entry lists
+the ``objects`` of the frame. Each object has a ``category`` and a place. The place is either
+``parts``, the values of its pixels in the frame's label image (in ``labels.npz``; 1 to 9 are
+tables), or ``centroid_m`` and ``extent_m`` in the sensor frame.
 """
 
 import json

@@ -37,8 +37,8 @@ class RenderedView(NamedTuple):
     Attributes
     ----------
     frame : the depth image.
-    mesh_ids : (h, w) index of the mesh that each pixel shows, first the objects and then the
-        furniture; -1 without depth.
+    mesh_ids : (h, w) index of the mesh that each pixel shows, -1 without depth. The objects are
+        numbered first, then the furniture.
     visible : (k,) visible fraction of each object.
     table_from_camera : pose of the optical frame.
     sensor : name of the sensor.
@@ -69,7 +69,7 @@ def render_view(
 
 
 def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
-    """Draw a sensor: a preset, half of the time mixed with another, with random errors and size."""
+    """Draw a preset, half of the time mixed with another; vary its errors and its image size."""
     names = list(PRESETS)
     shares = np.array([_OFTEN.get(each, 1.0) for each in names])
     name, other = (str(each) for each in rng.choice(names, 2, p=shares / shares.sum()))
@@ -118,7 +118,8 @@ def _visible_fractions(
     """Return the visible fraction of each object, (count,).
 
     It is the object's number of depth pixels, divided by its number of pixels in an image twice as
-    wide and high in which nothing occludes it; 0 with fewer than `_FEWEST_PIXELS` depth pixels.
+    wide and high in which nothing occludes it. It is 0 for an object with fewer than
+    `_FEWEST_PIXELS` depth pixels.
     """
     seen_pixels = np.bincount(mesh_ids[mesh_ids >= 0], minlength=count + 1)
     width, height = camera.width // _COARSE, camera.height // _COARSE

@@ -51,7 +51,7 @@ _HEIGHT = DESCRIPTOR_NAMES.index("metric.height")
 _DETECTED = 0.75
 """Fraction of the detected objects that detection segments; the truth segments the others."""
 _FRAGMENTS = 0.3
-"""Fraction of the views from which a partial view is cut, too."""
+"""Fraction of the views from which a partial view is cut in addition."""
 _SETTINGS = Settings()
 
 
@@ -67,7 +67,7 @@ class SimulatedView(NamedTuple):
     distance : mean distance from the sensor, metres.
     resting_pose : ``upright``, ``lying``, ``upside_down``, ``leaning`` or ``tilted``.
     source : how the view was segmented: ``truth``, ``detected`` or ``fragment``; or ``background``,
-        a thin detection that shows no object, whose label is ``unknown``.
+        for a thin detection that shows no object and has the label ``unknown``.
     visible : number of the object's depth pixels, divided by its number of pixels if nothing
         occluded it.
     overlap : IoU of the view's points and the object's depth pixels.
@@ -256,7 +256,7 @@ def _segment_by_truth(
 ) -> View:
     """Return the true points of object ``k`` in its level frame.
 
-    The frame has random errors of about half a degree and 2 mm, as if detection had found it.
+    The frame has random errors of about half a degree and 2 mm, like a frame from detection.
     """
     indices = np.flatnonzero((image.mesh_ids == k) & (np.asarray(image.frame.depth) > 0))
     points = image.frame.xyz(indices)

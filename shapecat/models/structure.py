@@ -46,7 +46,7 @@ __all__ = ["Samples", "Series", "collect", "grow_rejection_trees", "label_object
 
 _GROWTH = Growth(500, 64, 0.06)
 _FOLDS = 3
-"""Number of parts of the samples; trees trained on the other parts classify each part."""
+"""Number of folds in which trees classify the samples that they were not trained on."""
 _OBJECT = 0.5
 """A merged segment is an object if more than this fraction of its labelled cells shows objects."""
 _CHUNK = 10

@@ -35,8 +35,8 @@ def written_paths(out: Path, format: str, *, color: bool = False) -> list[Path]:
 def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[list[Path]]:
     """Provide hidden paths; if the block succeeds, move the files written there to ``paths``.
 
-    The first path is the recording. Then delete the ``obsolete`` files, which an earlier recording
-    may have left.
+    The ``obsolete`` files, which an earlier recording may have left, are deleted, too. The first
+    path is that of the recording.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[li
 
 
 def _require_replaceable(path: Path) -> list[Path]:
-    """Return the files in a folder that a recording may replace; none if it is not a folder.
+    """Return the files of a folder that a recording may replace; none if the path is no folder.
 
     Raises
     ------

@@ -156,7 +156,7 @@ def _nothing_in_common(finished: FinishedRun, reference: Path, other: Reference[
 
 
 def _hardly_matches(rows: Sequence[Difference]) -> bool:
-    """Return whether both sides have unmatched objects, but hardly any objects match."""
+    """Return whether run and reference both have unmatched objects, but hardly any matched ones."""
     found, true = (Counter(row.difference for row in rows)[kind] for kind in ("surplus", "missed"))
     matched = len(rows) - found - true
     return min(found, true) > 0 and matched < _DOUBTFUL * (matched + min(found, true))

@@ -20,7 +20,7 @@ class FrameIdentities(NamedTuple):
 
     Attributes
     ----------
-    true, found : identities, without duplicates.
+    true, found : identities of the objects, without duplicates.
     similarity : (true, found) from 0 to 1; 0 for pairs that cannot be the same object.
     """
 

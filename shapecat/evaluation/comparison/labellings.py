@@ -32,8 +32,8 @@ UNREADABLE = (*MALFORMED, OSError, RecursionError)
 """Errors of reading a text file, and of using values from it that have wrong types or ranges."""
 _Frame = TypeVar("_Frame")
 Place = tuple[str | None, int, int | None]
-"""Topic, None for any; timestamp (ns) or else frame number; and the frame number that goes with a
-timestamp, None if unknown."""
+"""How a reference names a frame: its topic (None for any); its timestamp (ns), or its number if
+there is no timestamp; and its number in addition to a timestamp (None if unknown)."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Reference(ABC, Generic[_Frame]):
     kind: str
     """Kind of the reference, in words."""
     unit = "frames"
-    """Plural noun for what identifies frames, for messages."""
+    """Plural noun for the timestamps or numbers that identify frames, for messages."""
     tracked: bool = False
     """Whether objects have identities over time."""
     numbered: bool = False
@@ -160,15 +160,15 @@ def numbering_notes(other: Reference[Any], start_s: float | None) -> list[str]:
 
 
 def index_frames(path: Path, frames: Iterable[tuple[Place, _Frame]]) -> dict[Place, _Frame]:
-    """Return the index of entries that `find_frame` needs.
+    """Return a dictionary of entries for `find_frame`.
 
-    If frames of a topic have equal timestamps, their entries are found only with their numbers.
+    A frame is found by its timestamp alone, unless other frames of its topic have the same one:
+    then its number is needed, too.
 
     Parameters
     ----------
     path : path of the reference, for the message.
-    frames : pairs of a place and an entry. A place is the topic (None for any), the timestamp (ns)
-        or else the frame number, and the frame number beside a timestamp (None if unknown).
+    frames : pairs of a `Place` and the entry of this frame.
 
     Raises
     ------

@@ -193,7 +193,7 @@ _HEAD = ("frame", "difference", "true", "found", "track", "confidence", "overlap
 
 
 def _confidence(row: Difference) -> str:
-    """Return the confidence as text, which is empty for an unknown object, as in captions."""
+    """Return the confidence as text; it is empty for an unknown object, as in captions."""
     if row.confidence is None or row.category == UNKNOWN:
         return ""
     return confidence_text(row.confidence)
@@ -236,7 +236,7 @@ def _picture(picture: DifferenceImage) -> str:
 def place_captions(
     captions: Iterable[Caption], letter: float, width: int
 ) -> list[tuple[float, float, str]]:
-    """Return middle x, baseline y and text of each caption; move down those that would overlap.
+    """Return middle x, baseline y and text of each caption; overlapping ones are moved down.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Images of a colour camera beside the depth camera, with its own lens, of textured scenes."""
+"""Images of textured scenes from a colour camera that is mounted beside the depth camera."""
 
 import io
 from functools import cache
@@ -56,7 +56,7 @@ def render_colour(world: World, frame: int) -> tuple[U1, U1]:
 
 @cache
 def _distortion_map() -> tuple[Camera, I4, I4]:
-    """Return a finer pinhole camera, and the pixel of it that each pixel of the lens camera shows.
+    """Return a finer pinhole camera, and which of its pixels each pixel of the lens camera shows.
 
     The pixels are two arrays (h, w): rows and columns.
     """
@@ -120,7 +120,7 @@ def _colour_in(
     textures: F8,
     colours: U1,
 ) -> None:
-    """Paint the pixels (h, w, 3) that show a surface: two-tone bands and fine grain.
+    """Paint two-tone bands and fine grain into ``colours`` (h, w, 3) where a surface is visible.
 
     The texture uses only basic arithmetic, no sines, so that images are equal on every machine.
 

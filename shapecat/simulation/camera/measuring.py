@@ -91,7 +91,7 @@ def _inverse_depth_error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
 
 
 def _scaled_by_reflectance(cosine: F4, mesh_ids: I4, sensor: Sensor) -> F4:
-    """Return the cosines (h, w) of incidence, scaled by the reflectance of each mesh."""
+    """Return the cosines (h, w) of the incidence angles, times the reflectance of each mesh."""
     if sensor.log_reflectance_std <= 0 or mesh_ids.max(initial=-1) < 0:
         return cosine
     draws = np.random.default_rng((sensor.device, 2)).normal(
@@ -102,7 +102,7 @@ def _scaled_by_reflectance(cosine: F4, mesh_ids: I4, sensor: Sensor) -> F4:
 
 
 def _drop_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> None:
-    """Mark oblique surfaces as ``lost``; ``cosine`` (h, w) is that of the angle of incidence."""
+    """Mark oblique surfaces as ``lost``; ``cosine`` (h, w) is the cosine of the incidence angle."""
     if sensor.grazing_cosine > 0:
         window = (sensor.hole_px, sensor.hole_px)
         threshold_noise = noise(cosine.shape, window, 0.5 * sensor.grazing_cosine, rng)
@@ -146,7 +146,7 @@ def _blended_edges(inverse: F8, width: int) -> F8:
 
 @kernel
 def _write_depth(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, mesh_ids: I4) -> None:
-    """Write the quantized depth, metres, with its error; without depth, set the mesh id to -1.
+    """Add the error, quantize, and write the depth, metres; without depth, the mesh id becomes -1.
 
     ``limits`` are the step of the inverse depth and the least and the greatest depth.
     """
@@ -239,7 +239,7 @@ def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
 
 @kernel
 def _fill_shadow(inverse: F8, mesh_ids: I4, shadow: Bool, growth_px: I4) -> None:
-    """Extend the surface on the nearer side of each shadow into it, as stereo matching does.
+    """Extend the surface on the nearer side of a shadow into the shadow, as stereo matching does.
 
     ``growth_px`` (h // 3 + 1, 16) holds the widths of the extension, which vary over the image.
     """

@@ -27,7 +27,7 @@ def noise(
     ----------
     shape : (h, w).
     deviation : standard deviation of the noise.
-    smoothings : how often the noise is averaged over the window.
+    smoothings : number of times that the noise is averaged over the window.
     """
     wide, tall = window
     height, width = (n + smoothings * (k - 1) for n, k in zip(shape, (tall, wide), strict=True))
@@ -53,7 +53,7 @@ def _gain(width: int, times: int) -> float:
 
 @lru_cache(maxsize=8)
 def fixed_error(shape: tuple[int, int], deviation: float, spacing: int, device: int) -> F4:
-    """Return the fixed error (h, w) of a device's inverse depth, 1/m, which is smooth.
+    """Return the smooth, fixed error (h, w) of a device's inverse depth, 1/m.
 
     Parameters
     ----------

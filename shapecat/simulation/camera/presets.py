@@ -224,7 +224,7 @@ PRESETS = {
     "l515": _L515,
     "phone": _PHONE,
 }
-"""Real depth cameras by name. Append new ones: their order determines the sensors of training."""
+"""Real depth cameras by name. Append new ones at the end: training picks by position."""
 
 SENSORS = {"ideal": IDEAL, **PRESETS}
 """All sensors by name."""

@@ -151,8 +151,8 @@ def _rasterize(
     """Find the nearest triangle of each pixel, and the normal of each triangle.
 
     ``points`` (n, 3) are in the optical frame, metres; ``intrinsics`` are fx, fy, cx, cy in pixels.
-    Write the inverse depth (1/m) into ``nearest`` (h, w) and the triangles into ``triangle_ids``
-    (h, w) where a pixel shows one, and the normals into ``normals`` (m, 3).
+    Where a pixel shows a triangle, write its inverse depth (1/m) into ``nearest`` (h, w), and its
+    index into ``triangle_ids`` (h, w). Write the normals of the triangles into ``normals`` (m, 3).
     """
     height, width = nearest.shape
     fx, fy, cx, cy = intrinsics

@@ -18,11 +18,11 @@ class Sensor:
     ----------
     camera : intrinsics.
     nearest_m, farthest_m : limits of the measured depth.
-    step : quantization of the inverse depth, 1/m; 0 is none.
+    step : quantization of the inverse depth, 1/m; 0 for none.
     noise : standard deviation of the inverse depth, 1/m, for cameras that triangulate.
     noise_m : standard deviation of the depth, relative to the depth, for time-of-flight cameras.
     noise_window : (across, down) correlation window of the noise, pixels.
-    smoothings : how often the noise and the edge jitter are averaged over their windows.
+    smoothings : number of times that the noise and the edge jitter are averaged over their windows.
     fixed_error : standard deviation of the device's low-frequency error of the inverse depth, 1/m;
         the error is the same in all images.
     fixed_error_px : distance over which this error varies, pixels.
@@ -30,7 +30,7 @@ class Sensor:
     edge_jitter_px : standard deviation of the displacement of depth edges, pixels.
     edge_jitter_window : (across, down) correlation window of this displacement, pixels.
     shadow_m : x positions of the light source and of other cameras, relative to this one, metres;
-        depth is missing at points that one of them does not see.
+        depth is missing at points that are hidden from one of them.
     shadow_fill_px : mean width by which these shadows are narrower than geometry predicts, pixels.
     grazing_cosine : cosine of the angle of incidence at which half of the pixels lack depth.
     log_reflectance_std : standard deviation of the logarithm of the objects' reflectance; on dark
@@ -39,9 +39,10 @@ class Sensor:
         pixels.
     holes : approximate fraction of the pixels in random holes.
     hole_px : approximate width of the largest holes, including those on oblique surfaces, pixels.
-    blend_px : window that mixes near and far at depth edges (flying pixels), pixels; 0 is none.
-    smoothing_px : window that rounds edges and corners within a surface (multipath, smoothing
-        windows), pixels; 0 is none.
+    blend_px : width of the window that mixes near and far at depth edges (flying pixels), pixels; 0
+        for none.
+    smoothing_px : width of the window that rounds edges and corners within a surface (multipath,
+        smoothing filters), pixels; 0 for none.
     border_px : (left, right, top, bottom) margins of the image without depth, pixels.
     """
 

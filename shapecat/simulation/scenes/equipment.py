@@ -81,7 +81,7 @@ def make_resting_arms(
     Parameters
     ----------
     camera : ``world_from_camera`` with optical axes.
-    intrinsics : of this camera.
+    intrinsics : intrinsics of this camera.
     height : height of the support, metres, world frame.
     """
     parts: list[Mesh] = []
@@ -133,7 +133,7 @@ def _resting_arm(rng: Generator, start: F8, end: F8) -> list[Mesh]:
 
 
 def _links(joints: Sequence[F8], radii: Sequence[float]) -> list[Mesh]:
-    """Return a tube between each pair of joints, and a motor at each joint except the first."""
+    """Return a tube between consecutive joints, and a motor at each joint except the first."""
     parts = []
     for (start, end), radius in zip(pairwise(joints), radii, strict=True):
         ends = smooth_path(np.stack([start, end]), 6)

@@ -173,4 +173,4 @@ SCENES: dict[str, Callable[[Generator, _SceneSpec], World]] = {
     "rearranged": lambda rng, spec: rearranged(rng, spec.draw(rng, 8), spec.filming),
     "empty": _empty,
 }
-"""The function that makes a random scene of each kind."""
+"""For each kind of scene, the function that makes a random one."""

@@ -69,7 +69,7 @@ def place_piece(
     ----------
     pose : ``world_from_mesh``, in its stable pose.
     support : the support that it stands on, unless it stands on another object.
-    on_track : the object that it stands on, if any.
+    on_track : number of the object that it stands on, if any.
     """
     # Every pose of a box counts as upright.
     resting_pose = "upright" if piece.category == "box" else piece.stable_pose.name

@@ -32,7 +32,7 @@ _MOST = 120
 _MARGIN_M = 0.01
 """Minimum distance of a group from the edge of its support and from other groups."""
 _AREA_M = 0.45
-"""Half the length of the area in the middle of a support that groups stand on."""
+"""Maximum half size of the area, in the middle of a support, in which groups are placed."""
 _TOP_M = 0.03
 """Minimum width of a top face that carries another object."""
 

@@ -104,7 +104,7 @@ class World(Record):
     Attributes
     ----------
     kind : name of the kind of scene.
-    supports, objects : the meshes of the scene; mesh ids number the supports first.
+    supports, objects : contents of the scene; mesh ids count the supports, then the objects.
     path : ``world_from_camera`` for each of the t images, with the camera's optical axes.
     turns : (t,) rotation of all objects about the world's z axis in each frame, radians; None if
         they do not rotate.

@@ -115,4 +115,4 @@ def _sphere(count: int) -> F8:
 
 _AXES = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1]), -1).reshape(-1, 3).astype(float)
 _ALL_AROUND = np.concatenate([_AXES, _sphere(100)])
-"""Directions in which to look for the corners of a hull; `_AXES` keep the corners of boxes."""
+"""Directions in which to look for the corners of a hull; `_AXES` finds all corners of a box."""

@@ -15,7 +15,7 @@ from shapecat.simulation.shapes.toys import TOYS
 __all__ = ["DISTRACTORS", "make_distractor"]
 
 DISTRACTORS: dict[str, Callable[[Generator], Mesh]] = {**KITCHEN, **TOOLS, **TOYS}
-"""The function that makes a random object of each kind outside the categories."""
+"""For each kind of object outside the categories, the function that makes a random one."""
 
 
 def make_distractor(rng: Generator, kind: str | None = None) -> tuple[str, Mesh]:

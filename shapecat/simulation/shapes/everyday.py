@@ -155,4 +155,4 @@ EVERYDAY: dict[str, Callable[[Generator], Mesh]] = {
     "vehicle": _vehicle,
     "fixture": _fixture,
 }
-"""The function that makes a random object of each family."""
+"""For each family of objects, the function that makes a random one."""

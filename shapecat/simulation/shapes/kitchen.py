@@ -197,4 +197,4 @@ KITCHEN: dict[str, Callable[[Generator], Mesh]] = {
     "pear": _pear,
     "mushroom": _mushroom,
 }
-"""The function that makes a random object of each kind."""
+"""For each kind of object, the function that makes a random one."""

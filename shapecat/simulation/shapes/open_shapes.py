@@ -179,7 +179,7 @@ def _hollow(
 
 
 def _section(rng: Generator, *, oval: float, square: float, facets: float) -> dict[str, Any]:
-    """Draw a cross-section, as keyword arguments of `lathe`: mostly round.
+    """Draw a cross-section, mostly a round one; return it as keyword arguments of `lathe`.
 
     ``oval``, ``square`` and ``facets`` are the probabilities of an oval, a rounded square and a
     polygon.
@@ -197,7 +197,7 @@ def _section(rng: Generator, *, oval: float, square: float, facets: float) -> di
 def _handle_shape(rng: Generator, diameter: float, height: float) -> tuple[F8, float, float]:
     """Draw a handle: its curve (k, 2), its radius and its flatness.
 
-    The curve is outward from the wall and upward from half its height, metres.
+    The columns of the curve are the distance from the wall and the height above its middle, metres.
     """
     tall = height * rng.uniform(0.25, 0.4)
     depth = diameter * rng.uniform(0.2, 0.42)

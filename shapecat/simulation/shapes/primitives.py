@@ -180,11 +180,11 @@ def _box_lines(half: float, radius: float, fine: int) -> F8:
 
 
 def extrude(outline: Points, height: float) -> Mesh:
-    """Extrude a flat outline from z = 0 to ``height``; it must be star-shaped about its mean.
+    """Extrude a flat outline from z = 0 to ``height``.
 
     Parameters
     ----------
-    outline : (k, 2) corners in order, metres.
+    outline : (k, 2) corners in order, metres; star-shaped about their mean.
     height : metres.
     """
     outline = np.asarray(outline, np.float64)

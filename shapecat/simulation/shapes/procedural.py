@@ -133,4 +133,4 @@ PROCEDURAL: dict[str, Callable[[Generator], Mesh]] = {
     "frame": _frame,
     **EVERYDAY,
 }
-"""The function that makes a random object of each family."""
+"""For each family of objects, the function that makes a random one."""

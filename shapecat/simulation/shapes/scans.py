@@ -53,8 +53,8 @@ def load_mesh(path: Path) -> Mesh:
 def uprighted(mesh: Mesh, category: str) -> Mesh:
     """Turn a mesh upright; its category tells which of the six axis directions is up.
 
-    The axis of a can is the one along which its outline looks roundest. The axis of a bottle is
-    preferably long, too, and its narrow end is up. A cup, bowl or plate is turned so that its
+    The axis of a can is the one along which its outline looks roundest. For the axis of a bottle,
+    its length counts, too, and the narrow end is up. A cup, bowl or plate is turned so that its
     inside, seen from above, lies as deep as possible below its top. A box or a ball keeps the axes
     of the file.
     """
@@ -94,7 +94,7 @@ def _narrow_end(points: F8, triangles: I4) -> float:
 
 
 def _slice_area(corners: F8, z: float) -> float:
-    """Return the area, within its convex hull, of the section of triangles (m, 3, 3) at ``z``."""
+    """Return the area of the section of triangles (m, 3, 3) at ``z``, taken to be convex."""
     a, b = corners, np.roll(corners, -1, axis=1)
     cut = (a[..., 2] < z) != (b[..., 2] < z)
     a, b = a[cut], b[cut]

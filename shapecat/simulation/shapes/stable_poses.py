@@ -12,7 +12,7 @@ from shapecat.types import Pose
 __all__ = ["StablePose", "choose_stable_pose", "stable_poses"]
 
 _UPRIGHT = 0.966
-"""Minimum cosine between the axis of an upright mesh and up, for 15 degrees."""
+"""Minimum cosine of the angle between the z axis of an upright mesh and up: 15 degrees."""
 
 
 class StablePose(Record):
@@ -36,7 +36,7 @@ def stable_poses(mesh: Mesh) -> tuple[StablePose, ...]:
 
     Returns
     -------
-    One pose for each stable face, in the order of the normals.
+    One pose for each stable face, sorted by the normal of the face.
     """
     points = np.asarray(mesh.vertices, np.float64)
     hull = ConvexHull(points)

@@ -148,4 +148,4 @@ TOOLS: dict[str, Callable[[Generator], Mesh]] = {
     "spool": _spool,
     "shoe": _shoe,
 }
-"""The function that makes a random object of each kind."""
+"""For each kind of object, the function that makes a random one."""

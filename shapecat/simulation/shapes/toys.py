@@ -136,4 +136,4 @@ TOYS: dict[str, Callable[[Generator], Mesh]] = {
     "plush": _plush,
     "blob": _blob,
 }
-"""The function that makes a random object of each kind."""
+"""For each kind of object, the function that makes a random one."""
