@@ -1,4 +1,4 @@
-"""Overlap of found and true objects: masks, matched one to one, and boxes."""
+"""Overlap of found and true objects: of masks, which are matched one to one, and of 3D boxes."""
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass

@@ -97,7 +97,7 @@ def _states(
     rows: Sequence[Difference],
     size: int,
 ) -> U1:
-    """Return the state of each pixel, (n,): 0 without an object, else 1 + an index of `COLOURS`.
+    """Return the state of each pixel, (n,): 0 without an object, else 1 to 4 as in `COLOURS`.
 
     Where a found object covers a true one that it does not match, its pixels count as surplus, so
     that split objects are visible.

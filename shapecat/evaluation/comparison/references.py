@@ -102,7 +102,7 @@ class SimulatedTruth(Reference[dict[str, Any]]):
         self._labels = _LabelImages(labels)
 
     def labelling(self, entry: dict[str, Any]) -> Labelling:
-        """Return the objects of an entry.
+        """Return the objects of a frame, given its entry in the truth.
 
         Raises
         ------

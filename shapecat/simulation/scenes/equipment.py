@@ -76,7 +76,7 @@ def make_own_arms(rng: Generator, camera: Pose, height: float) -> list[Mesh]:
 def make_resting_arms(
     rng: Generator, camera: Pose, intrinsics: Camera, height: float
 ) -> list[Mesh]:
-    """Return arms on a support or just above it, which enter the image from its border.
+    """Return arms that enter the image from its border, and lie on a support or just above it.
 
     Parameters
     ----------
