@@ -18,7 +18,7 @@ from shapecat.cameras.colour import ColourView
 from shapecat.colour.image_masks import find_masks
 from shapecat.completion import ENOUGH_POINTS, complete
 from shapecat.config import Settings
-from shapecat.depth_fusion import Earlier, drop_missing_depth, fuse
+from shapecat.depth_fusion import Earlier, fuse, keep_same_surface
 from shapecat.description import DESCRIPTOR_NAMES, describe
 from shapecat.detection import detect
 from shapecat.errors import ModelError
@@ -142,8 +142,9 @@ def _perceive(
     """Perceive a frame; return the result and the state for the next frame."""
     clock, frame, range_m = _Clock(), given.frame, perceiver.settings.detection.max_range_m
     fused = given._replace(frame=fuse(frame, given.earlier, range_m=range_m), earlier=())
-    if state.perception is not None and _repeats_frame(fused, state.reference, range_m):
-        repeated = _copy_for(frame, state.perception)
+    then = state.reference
+    if then is not None and state.perception and _repeats_frame(fused, then, range_m):
+        repeated = _restrict_to(frame, then.frame, _copy_for(frame, state.perception))
         clock.lap("detect")
         return replace(repeated, seconds=clock.seconds), state
     scene, detections, keys = _perceive_objects(fused, state.keys, perceiver, clock)
@@ -157,7 +158,7 @@ def _perceive(
         seconds=clock.seconds,
     )
     after = _BlockState(fused, perception, keys)
-    return (perception if fused.frame is frame else _restrict_to(frame, perception)), after
+    return _restrict_to(frame, fused.frame, perception), after
 
 
 def _perceive_objects(
@@ -203,9 +204,9 @@ def _add_masks(given: PerceptionInput, perception: Perception) -> Perception:
     return replace(perception, seconds=seconds, masks=masks)
 
 
-def _repeats_frame(now: PerceptionInput, then: PerceptionInput | None, range_m: float) -> bool:
+def _repeats_frame(now: PerceptionInput, then: PerceptionInput, range_m: float) -> bool:
     """Return whether a frame shows the same as an earlier one, with the same up direction."""
-    if then is None or (now.up is None) != (then.up is None):
+    if (now.up is None) != (then.up is None):
         return False
     if now.up is not None and then.up is not None and now.up @ then.up < _SAME_UP:
         return False
@@ -218,19 +219,20 @@ def _copy_for(frame: Frame, first: Perception) -> Perception:
         replace(d, seconds=0.0, reused_from=first.index if d.reused_from is None else d.reused_from)
         for d in first.detections
     )
-    again = replace(
+    return replace(
         first,
         index=frame.index,
         stamp_ns=frame.stamp_ns,
         detections=detections,
         reused_from=first.index,
     )
-    return _restrict_to(frame, again)
 
 
-def _restrict_to(frame: Frame, perception: Perception) -> Perception:
-    """Remove pixels without depth in the frame itself from the candidates."""
-    scene = drop_missing_depth(perception.scene, frame)
+def _restrict_to(frame: Frame, perceived: Frame, perception: Perception) -> Perception:
+    """Remove pixels that show something else in the frame itself from the candidates."""
+    if perceived is frame:
+        return perception
+    scene = keep_same_surface(perception.scene, frame, perceived)
     detections = tuple(
         replace(detection, candidate=candidate)
         for detection, candidate in zip(perception.detections, scene.candidates, strict=True)

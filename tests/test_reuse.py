@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import shapecat.pipeline
 from shapecat.config import Settings
 from shapecat.errors import ConfigError
-from shapecat.geometry import IDENTITY, transform
+from shapecat.geometry import IDENTITY, compose, transform
 from shapecat.perception import Perceiver, PerceptionInput
 from shapecat.reuse import shows_the_same
 from shapecat.reuse.views import KeyView, _similar, find_repeats, reused, view_object
@@ -87,6 +87,23 @@ def test_still_scene_is_described_once() -> None:
             share = np.isin(now.candidate.indices, then.candidate.indices).mean()
             assert share == 1.0
             assert len(now.candidate.indices) > 0.9 * len(then.candidate.indices)
+
+
+def test_reused_masks_leave_out_what_lies_behind_the_object() -> None:
+    """The outline may have shifted by a pixel or two; crops would reach down to the floor."""
+    world = still_world(2)
+    aside = Pose(Rotation.from_euler("y", 0.1, degrees=True).as_matrix(), np.zeros(3))
+    world = replace(world, path=(world.path[0], compose(world.path[1], aside)))
+    _, repeated = perceive(world)
+    frame, _ = render_frame(world, 1, rng=np.random.default_rng(1), sensor=KINECT)
+
+    assert repeated.reused_from == 0
+    for found in repeated.detections:
+        box = found.candidate.box
+        points = frame.xyz(found.candidate.indices) - box.center
+        in_box = points @ Rotation.from_quat(box.orientation).as_matrix()
+        assert len(points) > 50
+        assert (np.abs(in_box) < box.size / 2 + 0.03).all()
 
 
 def test_reused_masks_cover_only_depth_of_their_frame() -> None:

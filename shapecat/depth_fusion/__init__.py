@@ -3,7 +3,7 @@
 `fuse` joins a frame with the earlier ones that `RecentFrames` keeps.
 """
 
-from shapecat.depth_fusion.fusion import drop_missing_depth, fuse
+from shapecat.depth_fusion.fusion import fuse, keep_same_surface
 from shapecat.depth_fusion.recent import Earlier, RecentFrames
 
-__all__ = ["Earlier", "RecentFrames", "drop_missing_depth", "fuse"]
+__all__ = ["Earlier", "RecentFrames", "fuse", "keep_same_surface"]

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from shapecat.arrays import F4
+from shapecat.arrays import F4, I4
 from shapecat.depth_fusion.recent import Earlier
 from shapecat.geometry import AGREE, DISCONTINUITY, IDENTITY, NEAREST_M
 from shapecat.jit import kernel
 from shapecat.types import Camera, Frame, Pose, Scene
 
-__all__ = ["drop_missing_depth", "fuse"]
+__all__ = ["fuse", "keep_same_surface"]
 
 LEAST_SHARE = 0.9
 """Minimum fraction of the compared depths that differ by less than a `DISCONTINUITY`; below it,
@@ -75,16 +75,26 @@ def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
     return replace(frame, depth=total / np.maximum(count, 1))
 
 
-def drop_missing_depth(scene: Scene, frame: Frame) -> Scene:
-    """Remove from the candidates of a scene the pixels where the frame, unfused, has no depth."""
-    if frame.depth is None:
+def keep_same_surface(scene: Scene, frame: Frame, perceived: Frame) -> Scene:
+    """Remove from the candidates of a scene the pixels that show something else in a frame.
+
+    Parameters
+    ----------
+    scene : the result of detection on ``perceived``.
+    frame : a single frame that ``perceived``, fused or earlier, stands for. Pixels without depth in
+        it, or with the depth of another surface, are removed.
+    """
+    if frame.depth is None or perceived.depth is None:
         return scene
-    measured = frame.depth.reshape(-1) > 0
+    depth, expected = frame.depth.reshape(-1), perceived.depth.reshape(-1)
+
+    def shared(pixels: I4) -> I4:
+        z, other = depth[pixels], expected[pixels]
+        return pixels[(z > 0) & (np.abs(z - other) <= np.float32(DISCONTINUITY) * z * other)]
+
     return replace(
         scene,
-        candidates=tuple(
-            replace(item, indices=item.indices[measured[item.indices]]) for item in scene.candidates
-        ),
+        candidates=tuple(replace(item, indices=shared(item.indices)) for item in scene.candidates),
     )
 
 
