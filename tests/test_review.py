@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -675,6 +676,20 @@ def test_screenshot_ends_viewer_process(tmp_path: Path, monkeypatch: pytest.Monk
     while alive(pid) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not alive(pid)
+
+
+def test_slow_screenshot_is_tried_again(tmp_path: Path) -> None:
+    """Rerun waits 15 s for a picture; a loaded machine needs longer."""
+    answers = [TimeoutError("Deadline expired"), TimeoutError("Deadline expired"), None]
+    client, viewer = Mock(), Mock()
+    viewer.poll.return_value = None
+    client.save_screenshot.side_effect = list(answers)
+    review_viewer._save(client, tmp_path / "r.png", viewer)
+    assert client.save_screenshot.call_count == 3
+
+    client.save_screenshot.side_effect = TimeoutError("Deadline expired")
+    with pytest.raises(TimeoutError, match="Deadline"):
+        review_viewer._save(client, tmp_path / "r.png", viewer)
 
 
 @pytest.mark.slow

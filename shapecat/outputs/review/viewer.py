@@ -26,6 +26,8 @@ _SETTLE_S = 7.0  # until the viewer's notices have faded; everything else is dra
 _LOAD_S = 30.0
 _OPEN_S = 2.0
 """A viewer that cannot open a window ends within this time."""
+_SHOTS = 4
+"""Attempts at a screenshot: on a loaded machine, the software renderer takes half a minute."""
 _SCREENSHOT_SIZE = "1280x800"  # pixels
 _HERE = "127.0.0.1"
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
@@ -110,7 +112,7 @@ def take_screenshot(path: Path, png: Path) -> None:
             _wait_for(viewer, port, log)
             client = ViewerClient(f"rerun+http://{_HERE}:{port}/proxy")
             _show(client, path)
-            client.save_screenshot(str(png.absolute()))  # returns once it is saved
+            _save(client, png, viewer)
         except (RuntimeError, OSError) as error:
             ended = _has_ended(viewer)
             msg = _why(log) if ended else f"{path}: the viewer cannot draw it: {error}"
@@ -128,6 +130,18 @@ def _show(client: Any, path: Path) -> None:
         at = np.datetime64(stamp_ns, "ns")
         client.set_time("sensor_time", timestamp=at, play_state="paused")
     time.sleep(_SETTLE_S)
+
+
+def _save(client: Any, png: Path, viewer: subprocess.Popen[bytes]) -> None:
+    """Save a screenshot; try again if the viewer needs longer than the 15 s that Rerun waits."""
+    for left in reversed(range(_SHOTS)):
+        try:
+            client.save_screenshot(str(png.absolute()))  # returns once it is saved
+        except TimeoutError:
+            if not left or viewer.poll() is not None:
+                raise
+        else:
+            return
 
 
 def _last_stamp(client: Any) -> int | None:
