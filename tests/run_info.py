@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from shapecat.config import Settings
+
 __all__ = ["run_info"]
 
 
@@ -12,7 +14,7 @@ def run_info(**entries: Any) -> Any:
         "work": "",
         "input": {"path": "/recordings/lab.mcap", "bytes": 0, "digest": "", "files": []},
         "versions": {},
-        "settings": {},
+        "settings": Settings().as_dict(),
         "options": {
             "topics": ["/depth"],
             "up": "auto",

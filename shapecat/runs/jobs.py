@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from shapecat import __version__
 from shapecat.config import Settings
@@ -22,7 +22,7 @@ from shapecat.runs.identity import (
     unchanged,
     work_id,
 )
-from shapecat.runs.run_info import InputInfo, Options, OriginInfo, RunInfo
+from shapecat.runs.run_info import InputInfo, Options, OriginInfo, RunInfo, SettingsInfo
 
 __all__ = [
     "Job",
@@ -153,7 +153,7 @@ def describe_run(job: Job, categorizer: Categorizer) -> RunInfo:
             "python": platform.python_version(),
             **{name: version(name) for name in _LIBRARIES},
         },
-        "settings": job.settings.as_dict(),
+        "settings": cast("SettingsInfo", job.settings.as_dict()),
         "options": job.selection(),
         "model": {"id": categorizer.model_id, "categories": list(categorizer.categories)},
         "fixed_frame": None,

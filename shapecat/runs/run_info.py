@@ -24,8 +24,10 @@ __all__ = [
     "ModelInfo",
     "Options",
     "OriginInfo",
+    "OutputsInfo",
     "RunIdentity",
     "RunInfo",
+    "SettingsInfo",
     "parse_identity",
     "parse_run",
     "wrong_entry",
@@ -53,6 +55,25 @@ class Options(TypedDict):
     color: str | None
     mcap: bool
     rrd: bool
+
+
+class OutputsInfo(TypedDict):
+    """The settings of the outputs, which `annotate` reads again; see `OutputSettings`."""
+
+    boxes: str
+    markers: bool
+    cloud_points: int
+
+
+class SettingsInfo(TypedDict):
+    """The settings of the run, by group; see `Settings`."""
+
+    seed: int
+    reuse_frames: NotRequired[int]
+    detection: dict[str, Any]
+    surface: dict[str, Any]
+    tracking: dict[str, Any]
+    outputs: OutputsInfo
 
 
 class ModelInfo(TypedDict):
@@ -106,7 +127,7 @@ class RunInfo(RunIdentity):
     ``damaged`` is present if damage was found while reading the frames: see `Recording.damaged`.
     """
 
-    settings: dict[str, Any]
+    settings: SettingsInfo
     options: Options
     up: dict[str, Any]
     counts: Counts
