@@ -3,6 +3,7 @@
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache, partial
 from itertools import islice
 
 from shapecat.cameras.colour import ColourView
@@ -10,6 +11,8 @@ from shapecat.colour.image_masks import mask_of
 from shapecat.colour.masks import Mask
 from shapecat.errors import OutputError
 from shapecat.recordings import Recording
+from shapecat.recordings.colour_motion import view_at_its_time
+from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.runs.perceive.selection import read_frames
 from shapecat.runs.run_info import RunInfo
 from shapecat.types import Frame, LabelledFrame
@@ -60,10 +63,14 @@ def with_colour(
         needed=awaited.needs,
         same_images=awaited.image_of,
     )
+    transforms = cache(partial(TransformWindow.of, recording, run["options"]["topics"]))
     for label in awaited:
         for frame, view in read:
             if (label.topic, label.index) == (frame.topic, frame.index):
-                yield label, frame, _coloured(label, view)
+                pose, moved = label.fixed_from_sensor, view
+                if pose is not None:
+                    moved = view_at_its_time(view, frame, pose, run["fixed_frame"], transforms)
+                yield label, frame, _coloured(label, moved)
                 break
         else:
             msg = f"{recording.path}: has changed since it was processed; process it again"

@@ -93,6 +93,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
                             "test_recordings_damaged", "test_changes"),
     "shapecat.recordings.colour": ("test_recordings_worked", "test_recordings_colour",
                                    "test_colour", "test_changes", "test_viewpoint"),
+    "shapecat.recordings.colour_motion": ("test_colour_motion",),
     "shapecat.recordings.containers.mcap": ("test_recordings_worked", "test_annotated_mcap",
                                             "test_recordings", "test_recordings_damaged",
                                             "test_recordings_frames"),

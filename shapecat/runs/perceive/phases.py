@@ -15,6 +15,7 @@ from shapecat.executors.ordered_pool import OrderedPool
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, PerceptionInput
 from shapecat.recordings import Recording, Stream
+from shapecat.recordings.colour_motion import view_at_its_time
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.transforms.gravity import Upright
 from shapecat.rehearsal import rehearse
@@ -192,9 +193,17 @@ def _upright(work: Work, fixed_frame: str | None) -> Upright:
 
 def _oriented(work: Work, upright: Upright, skipped: Counter[str]) -> Iterator[Oriented]:
     """Yield the frames of a run with their orientations, once the up directions are decided."""
-    source = ((frame, colour, upright.orient(frame)) for frame, colour in _readings(work, skipped))
+    source = (_placed(upright, *reading) for reading in _readings(work, skipped))
     for frame, colour, orientation in UpCheck(upright, work.job.settings).before(source):
         yield frame, colour, upright.corrected(frame.topic, orientation)
+
+
+def _placed(upright: Upright, frame: Frame, colour: ColourView | None) -> Oriented:
+    """Look up the orientation of a frame, and the pose of its colour camera."""
+    orientation = upright.orient(frame)
+    pose = upright.corrected(frame.topic, orientation).fixed_from_sensor
+    view = view_at_its_time(colour, frame, pose, upright.fixed_frame, lambda: upright.transforms)
+    return frame, view, orientation
 
 
 def _readings(work: Work, skipped: Counter[str]) -> Iterator[tuple[Frame, ColourView | None]]:
