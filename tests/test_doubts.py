@@ -15,18 +15,21 @@ from tests.scenes import record
 
 
 @pytest.mark.parametrize("fixed_frame", ["map", None])
+@pytest.mark.parametrize("color", [{}, {"/depth": "/color"}])
 def test_every_doubt_is_looked_for(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fixed_frame: str | None
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fixed_frame: str | None, color: dict[str, str]
 ) -> None:
     """Without a fixed frame, there are no poses to doubt, and sensors are tracked apart."""
     of_poses = ["explain_jumps", "explain_misplacement", "explain_clocks"]
-    for name in ("explain_missing_planes", *of_poses):
+    of_colour = ["explain_colour_offsets"]
+    for name in ("explain_missing_planes", *of_colour, *of_poses):
         monkeypatch.setattr(doubts, name, lambda *_, name=name: iter([name]))
-    run = run_info(fixed_frame=fixed_frame, settings=Settings().as_dict())
+    run = run_info(fixed_frame=fixed_frame, color=color, settings=Settings().as_dict())
     recording: Any = None
     found = list(doubts.explain_doubts(recording, tmp_path, run))
 
-    assert found == ["explain_missing_planes", *(of_poses if fixed_frame else [])]
+    of_run = (of_colour if color else []) + (of_poses if fixed_frame else [])
+    assert found == ["explain_missing_planes", *of_run]
 
 
 def test_changed_surfaces_are_reported_once(

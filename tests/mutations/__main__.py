@@ -123,6 +123,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.runs.labels.same_objects": ("test_label_transfer",),
     "shapecat.runs.labels.track_table": ("test_labels", "test_label_transfer"),
     "shapecat.runs.labels.transfer": ("test_label_transfer",),
+    "shapecat.runs.perceive.colour_offsets": ("test_colour_offsets",),
     "shapecat.runs.perceive.doubts": ("test_doubts", "test_missing_planes", "test_pose_jumps"),
     "shapecat.runs.perceive.misplacement": ("test_misplacement",),
     "shapecat.runs.perceive.missing_planes": ("test_missing_planes",),

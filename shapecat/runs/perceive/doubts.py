@@ -1,7 +1,7 @@
-"""Warn about problems that may lead to missing tracks or wrong categories.
+"""Warn about problems that may lead to missing tracks, wrong categories or displaced masks.
 
-These are missing planes, wrong poses, different clocks, and surface settings that differ from those
-of training.
+These are missing planes, wrong poses, different clocks, colour images far in time from their depth
+images, and surface settings that differ from those of training.
 """
 
 from collections.abc import Iterator, Mapping
@@ -12,6 +12,7 @@ from typing import Any
 from shapecat.config import SurfaceSettings
 from shapecat.recordings import Recording
 from shapecat.runs.perceive.clocks import explain_clocks
+from shapecat.runs.perceive.colour_offsets import explain_colour_offsets
 from shapecat.runs.perceive.misplacement import explain_misplacement
 from shapecat.runs.perceive.missing_planes import explain_missing_planes
 from shapecat.runs.perceive.pose_jumps import explain_jumps
@@ -21,7 +22,7 @@ __all__ = ["explain_doubts"]
 
 
 def explain_doubts(recording: Recording, folder: Path, run: RunInfo) -> Iterator[str]:
-    """Yield a warning for each problem that may lead to missing tracks or wrong categories.
+    """Yield a warning for each problem that may spoil tracks, categories or masks.
 
     Parameters
     ----------
@@ -29,6 +30,8 @@ def explain_doubts(recording: Recording, folder: Path, run: RunInfo) -> Iterator
     """
     yield from _explain_surfaces(run["settings"]["surface"])
     yield from explain_missing_planes(recording, folder, run)
+    if run["color"]:
+        yield from explain_colour_offsets(folder)
     fixed_frame = run["fixed_frame"]
     if fixed_frame is not None:
         yield from explain_jumps(folder, fixed_frame)

@@ -16,11 +16,11 @@ from shapecat.runs.tables.reading import (
     read_together,
 )
 
-__all__ = ["explain_misplacement"]
+__all__ = ["APART_S", "GAP_S", "explain_misplacement", "moved_m"]
 
-_APART_S = 0.3
+APART_S = 0.3
 """Minimum time between two compared frames, so that even a slow camera has moved."""
-_GAP_S = 2.0
+GAP_S = 2.0
 """Maximum time between two compared frames, so that they show the same objects."""
 _MOVED_M = 0.03
 """The camera has moved if objects have moved farther than this relative to it."""
@@ -85,17 +85,17 @@ def _compare(folder: Path) -> dict[str, list[bool]]:
                 continue
             previous = latest.setdefault(key[0], centers)
             seconds = abs(stamp - previous.stamp_ns) * 1e-9
-            if seconds < _APART_S:
+            if seconds < APART_S:
                 continue
             latest[key[0]] = centers
-            moved = _moved_m(previous.sensor, centers.sensor)
-            if seconds < _GAP_S and moved > _MOVED_M:
-                farther = _moved_m(previous.fixed, centers.fixed) > _WORSE * moved
+            moved = moved_m(previous.sensor, centers.sensor)
+            if seconds < GAP_S and moved > _MOVED_M:
+                farther = moved_m(previous.fixed, centers.fixed) > _WORSE * moved
                 worse.setdefault(key[0], []).append(farther)
     return worse
 
 
-def _moved_m(previous: F8, current: F8) -> float:
+def moved_m(previous: F8, current: F8) -> float:
     """Return the median distance of objects (n, 3) to the nearest previous ones (m, 3), metres."""
     distances = np.linalg.norm(current[:, None] - previous, axis=2)
     return float(np.median(distances.min(axis=1)))

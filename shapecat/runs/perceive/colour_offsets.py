@@ -1,0 +1,125 @@
+"""Warn if colour images are so far in time from their depth images that masks are displaced."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F8
+from shapecat.runs.perceive.misplacement import APART_S, GAP_S, moved_m
+from shapecat.runs.tables.reading import (
+    frame_rows,
+    keys_of,
+    numbers,
+    numbers_or_nan,
+    read_together,
+)
+
+__all__ = ["explain_colour_offsets"]
+
+_FAR_S = 0.25
+"""Within a longer time, objects may have moved."""
+_SHIFT_M = 0.01
+"""Masks are displaced if objects move farther than this between the two images."""
+_UNEXPLAINED = 0.5
+"""Poses explain the motion of objects relative to the camera if, in the fixed frame, objects move
+less than this many times as far: their visible sides change, so that they never seem at rest."""
+_MIN_MOTIONS = 3
+"""Minimum number of comparisons on which the speed of objects is based."""
+
+
+class _Centers(NamedTuple):
+    """The centres (n, 3) of a frame's objects; ``fixed`` is NaN if the pose is unknown."""
+
+    stamp_ns: int
+    sensor: F8
+    fixed: F8
+
+
+@dataclass
+class _Stream:
+    """The colour images of a depth stream.
+
+    Attributes
+    ----------
+    offsets_s : for each frame, the time between its two images, seconds.
+    speeds : speeds of objects relative to the camera, m/s; 0 if poses explain the motion.
+    compared : the last compared frame.
+    """
+
+    offsets_s: list[float] = field(default_factory=list)
+    speeds: list[float] = field(default_factory=list)
+    compared: _Centers | None = None
+
+    def compare(self, centers: _Centers) -> None:
+        """Measure the motion of the objects in a frame since the last compared one."""
+        if not len(centers.sensor):
+            return
+        previous = centers if self.compared is None else self.compared
+        seconds = abs(centers.stamp_ns - previous.stamp_ns) * 1e-9
+        if 0 < seconds < APART_S:
+            return
+        self.compared = centers
+        if APART_S <= seconds < GAP_S:
+            moved = moved_m(previous.sensor, centers.sensor)
+            explained = moved_m(previous.fixed, centers.fixed) < _UNEXPLAINED * moved
+            self.speeds.append(0.0 if explained else moved / seconds)
+
+    def speed(self) -> float:
+        """Return the usual speed, m/s; 0 if it is unknown."""
+        return float(np.median(self.speeds)) if len(self.speeds) >= _MIN_MOTIONS else 0.0
+
+
+def explain_colour_offsets(folder: Path) -> Iterator[str]:
+    """Yield a warning for each topic whose masks may be displaced on colour images.
+
+    The motion of the camera between the two images of a frame is corrected if transforms give it;
+    that of objects is not.
+
+    Parameters
+    ----------
+    folder : folder with the tables of frames, detections and masks.
+    """
+    for topic, stream in _read(folder).items():
+        speed = stream.speed()
+        effect = "masks of objects that moved meanwhile are displaced"
+        offsets_s = [offset for offset in stream.offsets_s if offset > _FAR_S]
+        displaced_s = [offset for offset in stream.offsets_s if offset * speed > _SHIFT_M]
+        if displaced_s:
+            offsets_s = displaced_s
+            effect = (
+                f"objects move by about {speed * max(offsets_s):.2f} m meanwhile, so that their "
+                "masks are displaced; if it is the camera that moves, record transforms that give "
+                "its motion"
+            )
+        if offsets_s:
+            yield (
+                f"{topic}: in {len(offsets_s)} of {len(stream.offsets_s)} frames, the colour image "
+                f"is up to {max(offsets_s):.2f} s older or newer than the depth image; {effect}"
+            )
+
+
+def _read(folder: Path) -> dict[str, _Stream]:
+    """Return the colour images of each depth topic."""
+    streams: dict[str, _Stream] = {}
+    columns = ["topic", "frame"]
+    selected = {
+        "frames": [*columns, "stamp_ns"],
+        "detections": [*columns, "center", "center_fixed"],
+        "masks": [*columns, "color_stamp_ns"],
+    }
+    for frames, detections, masks in read_together(folder, selected):
+        rows = frame_rows(detections)
+        in_sensor, in_fixed = (numbers_or_nan(detections[n]) for n in selected["detections"][2:])
+        colour_ns = dict(
+            zip(keys_of(masks), numbers(masks["color_stamp_ns"]).tolist(), strict=True)
+        )
+        for key, stamp in zip(keys_of(frames), numbers(frames["stamp_ns"]).tolist(), strict=True):
+            stream = streams.setdefault(key[0], _Stream())
+            span = rows.get(key, slice(0, 0))
+            stream.compare(_Centers(stamp, in_sensor[span], in_fixed[span]))
+            if key in colour_ns:
+                stream.offsets_s.append(abs(colour_ns[key] - stamp) * 1e-9)
+    return streams
