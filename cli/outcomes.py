@@ -54,7 +54,7 @@ class Tally:
 
 
 def print_closing(tasks: Sequence["Task"], tally: Tally) -> None:
-    """Print the complete recordings in the order of the plan, if they are few, and totals."""
+    """Print the complete recordings if there are at most 100, transferred labels, and totals."""
     complete = tally.in_order(tasks)
     if 0 < tally.complete <= _MOST_ROWS:
         columns = ("recording", "frames", "seconds", "tracks", "results")

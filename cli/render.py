@@ -112,16 +112,16 @@ def discard_stdout() -> None:
 
 
 def note_off_support(categories: Sequence[str]) -> None:
-    """Print to stderr the categories of a data set whose views are probably in another frame."""
+    """Warn on stderr of categories whose views are probably in another coordinate frame."""
     if categories:
         text = "most views do not stand at z = 0: z must point up, with the support at z = 0"
         click.echo(f"Warning: {', '.join(categories)}: {text}", err=True)
 
 
 def note_skipped(learned: Mapping[str, Any]) -> None:
-    """Print to stderr the defects of the views from which `train` or `learn` has learned.
+    """Report on stderr the defective views in the data set of `train` or `learn`.
 
-    These are the number of skipped views, the categories without any, and wrong frames.
+    These are skipped views, categories that have lost all views, and views in another frame.
     """
     note_off_support(learned["off_support"])
     if learned["skipped"]:

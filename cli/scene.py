@@ -16,7 +16,7 @@ from .options import ANY_PATH
 def scene(*, run: Path, frame: int, topic: str | None) -> None:
     """Print which object stands on which in one frame of a run.
 
-    Merged tracks are one object; deleted ones are left out.
+    Tracks that a person merged are one object; tracks that a person deleted are left out.
 
     \b
     shapecat scene results/lab --frame 12

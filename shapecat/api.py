@@ -152,7 +152,7 @@ def process(
     ------
     ConfigError : an option or setting does not exist or has an invalid value, or several processes
         are requested and the script lacks the ``__main__`` line.
-    RecordingError : the recording cannot be read, or is a folder of several.
+    RecordingError : the recording cannot be read, or is a folder of several recordings.
     NoStreamError, ModelError, OutputError : as for the command, which prints them.
     """
     _require_known(settings, process.__annotations__)
@@ -192,7 +192,7 @@ def perceive(
     """Find and categorize the objects of one depth image or point cloud.
 
     Nothing is tracked and nothing is written; the result depends only on the arguments. The first
-    call after an installation compiles for a minute.
+    call after an installation compiles kernels for about a minute.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ def perceive(
 
 
 def _model_at(path: Path) -> Categorizer:
-    """Read a model; keep the last one, for the next image."""
+    """Read a model, or return the one read last if it is from the same, unchanged file."""
     with explained(f"{path}: cannot read the model", ModelError):
         file = path.stat()
     return _unchanged_model(path.resolve(), file.st_size, file.st_mtime_ns)

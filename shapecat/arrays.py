@@ -32,8 +32,8 @@ Bool: TypeAlias = NDArray[np.bool_]
 Records: TypeAlias = NDArray[np.void]
 """An array of a structured type, whose elements kernels read and write by the names of fields."""
 Row: TypeAlias = Any
-"""One of its elements."""
-# mypy tells floats, integers and Booleans apart; `freeze` enforces the size when a record is made.
+"""One element of such an array."""
+# mypy only tells floats, integers and Booleans apart; records enforce the exact type with `freeze`.
 
 
 def freeze(

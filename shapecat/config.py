@@ -75,8 +75,8 @@ class SurfaceSettings:
 
     def __post_init__(self) -> None:
         """Reject numbers and lengths that are out of range."""
-        # Coarser surfaces make most objects unknown.
-        # When distances are compared, the index of a neuron replaces their 10 lowest bits.
+        # Fewer neurons or larger voxels make most objects unknown. More neurons make distances
+        # too coarse, since the index of a neuron replaces their lowest bits.
         _check_range("surface.neurons", self.neurons, 20, 512)
         _check_least("surface.signals", self.signals, 100)
         _check_range("surface.component_share", self.component_share, 0.0, 1.0)

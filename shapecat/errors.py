@@ -16,7 +16,7 @@ __all__ = [
 ]
 
 _MOST_NAMES = 12
-"""Names that `listed` shows."""
+"""Largest number of names that `listed` shows."""
 
 
 class ShapecatError(Exception):

@@ -123,7 +123,8 @@ class _BlockState(NamedTuple):
 
     Attributes
     ----------
-    reference : the last frame that repeated no other, after fusion; None if there is none.
+    reference : the last frame that did not repeat an earlier one, after fusion; None if there is
+        none.
     perception : the result of that frame.
     keys : described objects, for comparison with later frames.
     """
@@ -254,7 +255,7 @@ class _Clock:
 
 
 def find_up(frame: Frame, settings: Settings) -> F4 | None:
-    """Return up (3,), sensor frame, from the supporting planes; None if these are too small."""
+    """Return the up direction (3,), sensor frame, of the supporting planes; None if too small."""
     scene = detect(frame, settings=settings.detection, rng=_rng(settings, frame, 0))
     return scene.up if sum(plane.area_m2 for plane in scene.planes) >= _ENOUGH_M2 else None
 

@@ -290,10 +290,10 @@ def annotate_again(
     Parameters
     ----------
     labels : the corrected table; by default the run's own tracks.csv.
-    by_place : ``labels`` is the table or folder of another run, and its labels are transferred to
-        the objects at the same places.
-    boxes : ``full`` or ``visible``; by default, boxes are not changed.
-    recording : path of the recording; by default where it was processed.
+    by_place : whether ``labels`` is the table or folder of another run, whose labels are
+        transferred to the objects at the same places.
+    boxes : ``full`` or ``visible``; by default, the kind of boxes is not changed.
+    recording : path of the recording; by default, the path at which it was processed.
 
     Returns
     -------

@@ -57,7 +57,7 @@ _TABLE_M = 0.4
 
 
 def find_ball() -> int:
-    """Detect a synthetic ball, plate and block; return how many match their own views."""
+    """Detect a synthetic ball, plate and block; return how many objects match their own views."""
     v, u = np.mgrid[:480, :640]
     rays = np.stack([(u - 320) / 525, (v - 240) / 525, np.ones(u.shape)], axis=-1)
     up = np.array([0, -np.sqrt(0.5), -np.sqrt(0.5)])
@@ -131,7 +131,8 @@ def find_mask() -> int:
 
 
 _REHEARSALS: tuple[Callable[[], object], ...] = (find_ball, recognize_ball)
-"""Functions that compile the kernels, for processes that share no kernel and take equally long."""
+"""Functions that compile the kernels when they are called. They share no kernel and take equally
+long, so that two processes can work at the same time."""
 _POLL_S = 0.1
 _TELL_S = 10.0
 _STAGES = ("completion", "description", "detection", "learning", "reuse", "surface")
@@ -154,7 +155,7 @@ def compile_all(observe: Observer = ignore, *, cores: int = 2, colour: bool = Fa
     observe : called before compilation begins, and then every ten seconds with the number of
         kernels compiled so far, also while another process compiles them.
     cores : largest number of processes.
-    colour : whether colour images need masks.
+    colour : whether to compile the kernels for masks on colour images, too.
 
     Raises
     ------

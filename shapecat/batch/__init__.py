@@ -1,1 +1,1 @@
-"""Batches of recordings: plan, process, and record the state of each."""
+"""Batches of recordings: plan them, process them, and record the state of each recording."""

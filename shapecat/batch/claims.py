@@ -1,10 +1,10 @@
 """Claims on run folders at URLs: only one process at a time works on a folder.
 
 While a process works on the folder ``NAME``, the object ``.NAME.claim`` exists beside it. The
-storage must support exclusive creation of an object. The owner rewrites its claim every few
-seconds; a process that sees it unchanged for longer takes it over. No clocks of different machines
-are compared. An owner checks its claim before it completes a run, so that a process that was
-presumed dead does not overwrite the results of another.
+storage must support exclusive creation of an object. The owner rewrites its claim every 10 seconds;
+a process that sees the claim unchanged for 45 seconds takes it over. The clocks of different
+machines are never compared. An owner checks its claim before it completes a run, so that a process
+that was presumed dead does not overwrite the results of another.
 """
 
 import json
@@ -30,7 +30,7 @@ _POLL_S = 1.0
 
 
 def claim_name(folder: str) -> str:
-    """Return the name of the claim on a run folder; it is in the same parent folder."""
+    """Return the name of the object that claims a run folder; the object is beside the folder."""
     return f".{folder}.claim"
 
 
@@ -43,12 +43,13 @@ class Claim:
     """
 
     def __init__(self, url: str, batch: str) -> None:
-        """Claim a run folder; wait up to 45 s to find out whether its owner is dead.
+        """Claim a run folder; if it is claimed, wait up to 45 s to see whether the owner is dead.
 
         Parameters
         ----------
-        batch : identifies the command. A claim of the same batch is taken over without waiting,
-            since the batch knows that its worker has died.
+        url : the run folder.
+        batch : identifies the command. A claim of the same command is taken over without waiting,
+            since a command sends a job again only after its worker has died.
 
         Raises
         ------
@@ -81,7 +82,7 @@ class Claim:
         return True
 
     def _is_stale(self, content: bytes, other: dict[str, Any]) -> bool:
-        """Return whether another claim stays unchanged; False if it disappears.
+        """Watch a claim; return True if it stays unchanged for 45 s, False if it disappears.
 
         Raises
         ------
@@ -142,11 +143,11 @@ class Claim:
 
 @contextmanager
 def claimed(url: str, batch: str) -> Iterator[Claim]:
-    """Hold a claim on the run folder at a URL during the block.
+    """Claim the run folder at a URL, and renew the claim until the block ends.
 
     Parameters
     ----------
-    batch : identifies the command; a claim of the same batch is taken over without waiting.
+    batch : identifies the command; a claim of the same command is taken over without waiting.
 
     Raises
     ------

@@ -30,16 +30,17 @@ __all__ = ["SearchResult", "find_recordings"]
 _log = logging.getLogger(__name__)
 
 _GAP_NS = 10**10
-"""The longest time between the parts of a bag; takes are farther apart, or overlap."""
+"""Longest time between the parts of a bag; separate recordings are farther apart, or overlap."""
 _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """The recordings without duplicates, and the number of files skipped.
+    """The recordings that a search found, without duplicates.
 
-    ``notes`` name each path that leads to the same recording as an earlier one, and each folder
-    without a recording, such as a disk that is not mounted.
+    ``skipped`` counts the files that are no recordings. ``notes`` report each path that leads to
+    the same recording as an earlier path, and each folder without a recording, such as a disk that
+    is not mounted.
     """
 
     sources: list[Source]
@@ -50,15 +51,15 @@ class SearchResult:
 def find_recordings(sources: Sequence[str]) -> SearchResult:
     """Return the recordings among files, folders and URLs.
 
-    Patterns are expanded, for programs that call the command without a shell, unless a file has
-    this name. Folders are searched recursively, except hidden files and folders and run folders; a
-    ROS 2 bag counts as one recording. A single file is always kept. Among several, files with
-    neither the suffix nor the first bytes of a recording are skipped and counted, so that
-    ``folder/*`` works.
+    A pattern such as ``*.mcap`` is expanded, unless a file has this name; programs may call the
+    command without a shell. Folders are searched recursively; hidden files, hidden folders and run
+    folders are left out, and a ROS 2 bag counts as one recording. A file that is the only source
+    is always kept. Of several files, those with neither the suffix nor the first bytes of a
+    recording are skipped and counted, so that ``folder/*`` works.
 
     Raises
     ------
-    RecordingError : no recording was found.
+    RecordingError : no recording was found, or a URL cannot be reached.
     """
     search = search_url if len(sources) == 1 else search_url_beside_others
     remote = {found.url: found for source in sources if is_url(source) for found in search(source)}
@@ -73,7 +74,7 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
 
 
 def _expanded(source: str) -> list[Path]:
-    """Return the path itself, or the matches of a pattern, without those in matching folders."""
+    """Return the matches of a pattern, except those in a folder that matches; else the path."""
     if os.path.lexists(source):
         return [Path(source)]
     names = glob(source, recursive=True)  # noqa: PTH207  Path.glob finds hidden files, too
@@ -89,7 +90,7 @@ def _of_path(path: Path, real: Path) -> Source:
 
 
 def _search_paths(sources: Sequence[Path]) -> tuple[dict[Path, Path], int, list[str]]:
-    """Return the recordings, by resolved path, the number of files skipped, and notes."""
+    """Map resolved paths to the paths of recordings; also return the files skipped, and notes."""
     folders = {source for source in sources if source.is_dir() and not _is_bag(source)}
     if len(sources) == 1 and not folders:
         return {_real_path(sources[0]): sources[0]}, 0, []
@@ -116,7 +117,7 @@ def _is_bag(folder: Path) -> bool:
     """Return whether a folder is a ROS 2 bag: it has metadata, or its files are parts of one.
 
     ROS 2 names the parts of a bag a/a_0.mcap, a/a_1.mcap, ... In a folder with another name, such
-    files may be different takes, unless they follow each other in time, or one is compressed.
+    files may be separate recordings, unless they follow each other in time, or one is compressed.
     """
     try:
         if _has_bag_metadata(folder):
@@ -144,7 +145,10 @@ def _has_bag_metadata(folder: Path) -> bool:
 
 
 def _follow_in_time(paths: Sequence[Path]) -> bool:
-    """Return whether recordings follow each other in time without a gap."""
+    """Return whether each recording begins at most 10 s after the end of the one before it.
+
+    Unreadable recordings are ignored; at least two must be left.
+    """
     spans = []
     for path in paths:
         with suppress(RecordingError), open_recording(path) as recording:
@@ -154,10 +158,10 @@ def _follow_in_time(paths: Sequence[Path]) -> bool:
 
 
 def _search(folder: Path, searched: set[Path]) -> Iterator[Path]:
-    """Yield the recordings below a folder, sorted by name in each folder, links last.
+    """Yield the recordings below a folder; each folder is sorted by name, symbolic links last.
 
     No folder is searched twice, so links may form loops. A folder that may not be read, such as
-    ``lost+found``, is skipped, and reported.
+    ``lost+found``, is skipped, and the log says so.
     """
     real = _real_path(folder)
     if real in searched:
@@ -180,7 +184,7 @@ def _search(folder: Path, searched: set[Path]) -> Iterator[Path]:
 
 
 def _real_path(path: Path) -> Path:
-    """Resolve all symbolic links in a path; a link to itself, which `resolve` refuses, stays."""
+    """Resolve all symbolic links except one to itself, which `Path.resolve` refuses."""
     return Path(os.path.realpath(path))
 
 

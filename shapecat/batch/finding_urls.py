@@ -28,7 +28,7 @@ __all__ = ["search_url", "search_url_beside_others", "stat_url"]
 _log = logging.getLogger(__name__)
 
 _THREADS = 16
-"""Threads that read metadata: each request is a round trip."""
+"""Threads that read metadata, since each request waits for an answer over the network."""
 
 
 def _of_url(url: str, key: str = "", size: int = 0) -> Source:
@@ -38,7 +38,7 @@ def _of_url(url: str, key: str = "", size: int = 0) -> Source:
 
 
 def search_url(url: str) -> list[Source]:
-    """Return the recordings that match a URL pattern or are below a folder, or the URL itself.
+    """Return the matches of a URL pattern, the recordings below a URL folder, or the URL itself.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def search_url(url: str) -> list[Source]:
 
 
 def _search_matches(pattern: Location) -> Iterator[Source]:
-    """Yield the recordings that match a pattern, and those below folders that do."""
+    """Yield the recordings that match a pattern, and those below folders that match it."""
     matches = dict(pattern.matches())
     folders = {url for url, info in matches.items() if info.get("type") == "directory"}
     for url, info in matches.items():
@@ -68,7 +68,11 @@ def _search_matches(pattern: Location) -> Iterator[Source]:
 
 
 def search_url_beside_others(url: str) -> list[Source]:
-    """Search a URL; a missing one counts as a recording, which fails later, like a missing file."""
+    """Return the recordings at one of several URLs.
+
+    A URL where nothing exists is returned as a recording, and fails when it is opened, like a
+    missing file. A folder without recordings is logged.
+    """
     found = search_url(url)
     if found or next(Location(url).walk(deep=False), None) is None:
         return found or [_of_url(url)]
@@ -77,7 +81,7 @@ def search_url_beside_others(url: str) -> list[Source]:
 
 
 def _is_remote_folder(location: Location) -> bool:
-    """Return whether a URL is a folder, without a request if it has the suffix of a recording."""
+    """Return whether a URL is a folder; no request is made if it has the suffix of a recording."""
     if has_recording_suffix(location.url.partition("?")[0]):
         return False
     with suppress(RecordingError):  # reported when it is downloaded
@@ -86,7 +90,7 @@ def _is_remote_folder(location: Location) -> bool:
 
 
 def stat_url(url: str) -> tuple[str, int]:
-    """Return a key of the content at a URL and its size in bytes; empty and 0 if unknown."""
+    """Return a key of the content at a URL, and the bytes it holds; empty and 0 if unknown."""
     location = Location(url)
     with suppress(RecordingError):  # reported when it is downloaded
         info = location.info()
@@ -140,7 +144,7 @@ def _search_remote_folder(location: Location) -> Iterator[Source]:
 
 
 def _bags_among(folders: Iterable[str]) -> list[str]:
-    """Return the folders, by URL, that hold the metadata.yaml of a bag."""
+    """Return those of the folders (URLs) that hold the metadata.yaml of a ROS 2 bag."""
 
     def is_bag(folder: str) -> bool:
         return BAG_KEY in ((Location(folder) / "metadata.yaml").read() or b"")[:METADATA_BYTES]

@@ -18,7 +18,7 @@ __all__ = ["MOST_TRIES", "Ledger", "Outcome"]
 _log = logging.getLogger(__name__)
 
 MOST_TRIES = 2
-"""Attempts at a recording whose workers die, before it is reported as failed."""
+"""A recording is reported as failed when its worker has died in this many attempts."""
 _MOST_LINES = 1000
 """Lines of the manifest written at a time."""
 
@@ -34,7 +34,10 @@ class Outcome:
 
 
 class Ledger:
-    """Writes the manifest, if there is one; a failed write does not end the batch."""
+    """Counts the attempts at each recording, and writes the manifest, if there is one.
+
+    A failed write ends the writing, but not the batch.
+    """
 
     def __init__(self, manifest: Manifest | None) -> None:
         self._manifest = manifest
@@ -52,12 +55,12 @@ class Ledger:
         return None if self._manifest is None else self._manifest.entries.get(folder)
 
     def _is_recorded(self, entry: Entry, state: State) -> bool:
-        """Return whether the manifest has the same work of the same command in this state."""
+        """Return whether the last entry of the folder has this state, input, work and command."""
         last = self._last_entry(entry.folder)
         return last is not None and last.state == state and last.same_command(entry)
 
     def earlier_outcome(self, task: Task) -> Outcome:
-        """Return the outcome of a task that was complete before."""
+        """Return the outcome of a task that an earlier command completed."""
         job = task.job
         entry = self._last_entry(task.name)
         if entry is not None and entry.tracks is not None and entry.frames is not None:
@@ -74,7 +77,7 @@ class Ledger:
             self._in_progress.setdefault(task.name, replace(task.entry(), tries=1))
 
     def record_running(self, name: str) -> None:
-        """Record the start of a recording, once per attempt."""
+        """Record that the recording of a run folder is being processed, once per attempt."""
         with self._lock:
             entry = self._in_progress.get(name)
             if entry is not None and entry.state != "running":

@@ -53,10 +53,11 @@ State = Literal["planned", "running", "complete", "failed"]
 class Entry:
     """A line of the manifest: a recording and its state.
 
-    ``folder`` is the name of the run folder. ``input`` changes with the content of the recording,
-    ``work`` with the options, settings and model. ``command`` identifies a command that overwrites.
-    ``tries`` counts attempts, ``seconds`` is the duration, and ``tracks`` counts the tracks of each
-    category. ``time`` is UTC in ISO 8601.
+    ``folder`` is the name of the run folder. ``input`` is a key that changes with the content of
+    the recording, ``work`` one that changes with the options, settings and model. ``command``
+    identifies a command that overwrites. ``tries`` counts the attempts so far, ``seconds`` is the
+    processing time, and ``tracks`` counts the tracks of each category. ``time`` is when the line
+    was written, in UTC and ISO 8601.
     """
 
     folder: str
@@ -106,7 +107,7 @@ class Manifest:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Finish writing."""
+        """Do nothing: each line is written at once."""
 
     def begin(self) -> bytes:
         """Return the first megabyte of the file; empty if there is no readable file."""
@@ -150,7 +151,7 @@ class RemoteManifest(Manifest):
 
         Parameters
         ----------
-        shard : ``I-of-N``, which has parts of its own; empty without shards.
+        shard : ``I-of-N``; each shard has parts of its own. Empty without shards.
 
         Raises
         ------
@@ -246,7 +247,7 @@ def open_manifest(out: str, *, shard: str | None = None) -> Manifest:
 
     Raises
     ------
-    OutputError : shapecat did not make the file, or the storage at the URL cannot be read.
+    OutputError : shapecat did not make the existing file, or the URL cannot be read.
     """
     part = shard.replace("/", "-of-") if shard else ""
     manifest = RemoteManifest(out, part) if is_url(out) else Manifest(Path(out) / MANIFEST)
@@ -298,7 +299,7 @@ def _interned(name: str, value: Any) -> Any:
 
 @contextmanager
 def _appending(path: Path) -> Iterator[int]:
-    """Open and lock a file for appending; the lock ends with the process."""
+    """Open a file for appending, and lock it until the block or the process ends."""
     path.parent.mkdir(parents=True, exist_ok=True)
     file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
     try:

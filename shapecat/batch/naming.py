@@ -29,11 +29,14 @@ def name_folders(
 ) -> list[str]:
     """Return a unique run folder name for each recording: its file name without suffix.
 
-    Recordings with the same name get the name of their parent folder in front, then a number.
+    If several recordings have the same name, the name of the parent folder is put in front of it;
+    if that name is taken, too, a number is added.
 
     Parameters
     ----------
-    existing : the names that some recordings, by index, already have.
+    names : names of the recordings, without suffix.
+    parents : names of the folders that hold the recordings.
+    existing : maps the index of a recording to the name that its run folder already has.
 
     Examples
     --------
@@ -60,16 +63,17 @@ def name_folders(
 def existing_names(
     sources: Sequence[Source], out: str, listing: set[str], noted: Mapping[str, Entry]
 ) -> dict[int, str]:
-    """Return the names of the run folders that recordings, by index, already have in ``out``.
+    """Map the index of each recording that already has a run folder in ``out`` to its name.
 
-    A recording that comes to a batch later, or is processed alone, must not rename a run, nor an
-    interrupted or failed one. Recordings whose name is in ``out`` and shared by no other recording
-    are left out.
+    Without these names, a recording that is added to a batch later, or processed alone, would
+    change the name of another run, be it complete, interrupted or failed. A recording is left out
+    if its own name is in ``out`` and no other recording has it.
 
     Parameters
     ----------
+    out : folder or URL of the batch.
     listing : the names in ``out``.
-    noted : entries of the manifest in a folder; at a URL, those of all shards are read.
+    noted : entries of the manifest in a folder; at a URL, the entries of all shards are read.
     """
     counts = Counter(source.stem for source in sources)
     ambiguous = {
@@ -93,7 +97,7 @@ def existing_names(
 
 
 def _recording_in(out: str, name: str, entry: Entry | None) -> str:
-    """Return the path or URL of the recording of a run, also of one only begun, else empty."""
+    """Return the path or URL of the recording of a run, complete or begun; empty if unknown."""
     for folder in (Path(out, name), partial_path(Path(out, name))):
         with suppress(ShapecatError):
             return read_identity(folder)["input"]["path"]
@@ -102,7 +106,7 @@ def _recording_in(out: str, name: str, entry: Entry | None) -> str:
 
 
 def _recording_at_url(out: str, name: str, entry: Entry | None) -> str:
-    """Return the path or URL of the recording of a run; empty if there is no readable run."""
+    """Return the path or URL of the recording of a run at a URL; empty if unknown."""
     recording = entry.recording if entry is not None else ""
     if is_url(recording):
         return recording

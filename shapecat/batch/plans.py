@@ -34,7 +34,7 @@ _NamedSource = tuple[str, Source]
 _THREADS = 16
 """Threads that check files: on a network disk each check is a round trip."""
 _CHUNK = 256
-"""Recordings per unit of work of such a thread."""
+"""Recordings that a thread checks at a time."""
 
 Status = Literal["complete", "resume", "retry", "check", "new"]
 
@@ -49,8 +49,8 @@ class Task:
     out : folder or URL of the batch; ``name`` is the run folder in it.
     path, url : the recording; one of them is empty.
     status : ``complete`` according to manifest and run.json; ``resume`` if a run was interrupted;
-        ``retry`` if the last attempt failed; ``check`` if there are results of unknown origin; else
-        ``new``.
+        ``check`` if there is a run folder that may hold other results; ``retry`` if the last
+        attempt failed; else ``new``.
     bytes : size of the recording, 0 if unknown.
     input, work : keys; ``input`` changes with the content of the recording, ``work`` with the
         options, settings and model.
@@ -100,7 +100,7 @@ class Task:
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """Read ``I/N``, I from 0 to N; N/N is the same as 0/N, for jobs counted from 1.
+    """Return the index and the number of shards of ``I/N``; I may count from 0 or from 1.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 
 def part_of(named: Sequence[_NamedSource], index: int, count: int) -> list[_NamedSource]:
-    """Return a shard of the recordings; all shards are disjoint and cover the list."""
+    """Return a shard of the recordings; the shards are disjoint, and together cover the list."""
     return sorted(named, key=lambda pair: pair[0])[index::count]
 
 
@@ -147,7 +147,7 @@ def plan_batch(
     """Plan a task for each recording; keep the manifest open during the block.
 
     Only numbered files in a folder without metadata are opened: their times decide whether they are
-    parts of one bag or different takes.
+    parts of one bag or separate recordings.
 
     Parameters
     ----------
@@ -234,9 +234,9 @@ class _Planner:
 
 
 def _command(job: Job, work: str, entries: Iterable[Entry | None]) -> str:
-    """Return the id of the interrupted command that overwrites, or a new id.
+    """Return the id of the overwriting command that this one resumes, or a new id.
 
-    ``entries`` are the manifest entries of its recordings.
+    ``entries`` are the manifest entries of the recordings; None for one without an entry.
     """
     kind = "discard-labels" if job.discard_labels else "overwrite"
     unfinished = [
@@ -281,7 +281,7 @@ def _is_wanted_run(task: Task, model_id: str) -> bool:
         [topic.strip("/") for topic in topics] for topics in (run["options"]["topics"], job.topics)
     )
     return (
-        (job.origin or Path(run["input"]["path"]).exists())  # or it was moved
+        (job.origin or Path(run["input"]["path"]).exists())  # else the recording was moved
         and all(name in run["seconds"] and (job.folder / name).exists() for name in outputs)
         and not differing
         and requested in ([], chosen)

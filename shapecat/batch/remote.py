@@ -31,8 +31,8 @@ _PREVIOUS = tuple(name for name in RUN_FILES if name not in {*OUTPUTS, "report.h
 def process_remote(job: Job, observe: Observer, *, cores: int, batch: str) -> Summary:
     """Download the recording of a job, process it, and upload the results.
 
-    ``batch`` identifies the command that sent the job. The keys of the job keep the same work from
-    being done twice.
+    ``batch`` identifies the command that sent the job. If a run at the target has the keys of the
+    job, its summary is returned, and nothing is processed.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def _write_keys(job: Job, folder: Path) -> None:
 
 
 def _process(job: Job, local: Job, observe: Observer, cores: int) -> Summary:
-    """Process a job in the temporary folder; errors name the URLs instead of it."""
+    """Process a job in the temporary folder; messages of errors name the URLs instead of it."""
     try:
         return process(local, observe, cores=cores)
     except ShapecatError as error:
@@ -113,8 +113,9 @@ def _fetch_run(job: Job) -> tuple[Job, RunInfo | None]:
 
     Returns
     -------
-    The job, and the content of run.json, None if there is no run or it is overwritten. The job
-    overwrites a run whose replacement was interrupted.
+    The job, and the content of run.json; None if there is no run, or the job overwrites it. If
+    run.json is missing at the target, ``overwrite`` is set in the job, since the replacement of an
+    earlier run may have been interrupted.
 
     Raises
     ------
@@ -160,10 +161,10 @@ def _previous_location(place: Location) -> Location:
 
 
 def upload(folder: Path, url: str, claim: Claim) -> None:
-    """Upload a run folder, frames.parquet first and run.json last.
+    """Upload a run folder, frames.parquet first and run.json last, and replace an earlier run.
 
-    A search for recordings then always sees one of the two, and does not mistake annotated.mcap
-    for a recording.
+    A search for recordings then always sees one of the two files, and does not mistake
+    annotated.mcap for a recording.
 
     Raises
     ------

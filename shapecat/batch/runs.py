@@ -47,7 +47,7 @@ def process_here(
     Parameters
     ----------
     report : receives the progress.
-    cores : processes that perceive the frames of a recording.
+    cores : number of processes that perceive the frames of a recording.
     manifest : receives the state of each recording.
 
     Raises
@@ -176,8 +176,8 @@ def _reporter(name: str, address: str) -> Observer:
 def attempt(job: Job, observe: Observer, *, cores: int = 1, batch: str) -> Outcome:
     """Process one job; an error becomes its outcome, and an unexpected one is logged in full.
 
-    ``cores`` is the number of processes that perceive frames; ``batch`` identifies the
-    command; only a job with URLs uses it.
+    ``cores`` is the number of processes that perceive frames. ``batch`` identifies the command;
+    only jobs with URLs use it.
     """
     try:
         if job.origin or job.target:

@@ -22,9 +22,9 @@ _SUFFIXES = {".mcap", ".bag", ".db3"}
 _COMPRESSED = {".zst", ".zstd", ".gz", ".bz2", ".xz", ".lz4", ".zip"}
 COMPRESSED_HINT = "skipped: a compressed file, unpack it first"
 BAG_KEY = b"rosbag2_bagfile_information:"
-"""The first line of a bag's metadata.yaml; data sets have files of this name, too."""
+"""The first line of a bag's metadata.yaml; other data sets have files of this name, too."""
 METADATA_BYTES = 1 << 12
-"""The start of a metadata.yaml that is searched for this line."""
+"""This line is looked for in this many bytes at the start of a metadata.yaml."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Source:
 
     ``stem`` is its name without suffix and ``parent`` the name of its folder; both serve to name
     the run folder. ``key`` changes with the content at a URL, and ``bytes`` is its size; they are
-    empty and 0 for a path.
+    empty and 0 for a path, and if they are unknown.
     """
 
     path: str
@@ -45,7 +45,7 @@ class Source:
 
 
 def has_recording_suffix(name: str) -> bool:
-    """Return whether a file has the suffix of a recording, or of one whose recorder was killed."""
+    """Return whether a file ends in .mcap, .bag, .db3, or .bag.active (its recorder was killed)."""
     return name.endswith(".bag.active") or PurePosixPath(name).suffix.lower() in _SUFFIXES
 
 
@@ -56,20 +56,23 @@ def is_compressed(name: str) -> bool:
 
 
 def is_named_as_bag(folder: str, names: Collection[str]) -> bool:
-    """Return whether a folder with files of these names is a bag, whenever they were recorded."""
+    """Return whether the names of a folder and of its files suffice to call it a ROS 2 bag.
+
+    This is so if the files are numbered parts with the name of the folder, or one is compressed.
+    """
     parts = parts_among(names)
     any_compressed = any(name.endswith(".zstd") for name in names)
     return bool(parts) and (any_compressed or parts[0].rpartition("_")[0] == folder)
 
 
 def recordings_among(names: Iterable[str]) -> set[str]:
-    """Return the names of recordings, uncompressed."""
+    """Return the names that are recordings; the suffix .zstd of compressed ones is removed."""
     uncompressed = {name.removesuffix(".zstd") for name in names}
     return {name for name in uncompressed if PurePosixPath(name).suffix in _SUFFIXES}
 
 
 def parts_among(names: Iterable[str]) -> list[str]:
-    """Return the names of recordings if they are a_0.mcap, a_1.mcap, ..., in this order."""
+    """Return the recordings in order if they are named a_0.mcap, a_1.mcap, ...; else none."""
     recordings = recordings_among(names)
     first = PurePosixPath(min(recordings, default=""))
     base = first.stem.rpartition("_")[0]

@@ -56,9 +56,9 @@ def is_url(text: str) -> bool:
 
 
 def names_in(url: str) -> tuple[str, str]:
-    """Return the names of the folder and of the file at a URL, without query.
+    """Return the names of the parent folder and of the file at a URL, without the query.
 
-    A name that would be hidden or lead out of a folder stays encoded.
+    Names at http URLs are decoded, except one that would be hidden or lead out of a folder.
 
     Examples
     --------
@@ -113,7 +113,7 @@ class Location:
 
     @property
     def root(self) -> str:
-        """The URL in the spelling with which the URLs from `walk` begin."""
+        """The URL of this folder, spelt as at the start of the URLs that `walk` yields."""
         return self._url_of({"name": self._path})
 
     def _retry(self, participle: str, call: Callable[[], _T]) -> _T:
@@ -232,7 +232,7 @@ class Location:
 
         Parameters
         ----------
-        deep : whether to yield the files in subfolders; if not, the subfolders are yielded.
+        deep : whether to yield the files in subfolders, instead of the subfolders themselves.
         """
         with suppress(FileNotFoundError):
             for info in self._list(deep=deep):
@@ -257,7 +257,7 @@ class Location:
             yield from self._retry("listed", lambda: system.ls(path, detail=True))
 
     def _list_pages(self, *, deep: bool) -> Iterator[Mapping[str, Any]]:
-        """Yield the infos of a folder in S3, page by page: a bucket may hold millions."""
+        """Yield the info of each file in an S3 folder, page by page: a bucket may hold millions."""
         bucket, key, _ = self._system.split_path(self._path)
         prefix = f"{key.rstrip('/')}/" if key else ""
         delimiter = "" if deep else "/"

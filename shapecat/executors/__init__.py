@@ -31,7 +31,7 @@ _LOST = {
     *("WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"),  # Ray
 }
 _DROPPED = {"CancelledError", "FutureCancelledError", "CommClosedError"}
-"""Errors by name, since neither Dask nor Ray need be installed."""
+"""Names of errors, since neither Dask nor Ray has to be installed."""
 
 
 def open_executor(name: str, *, workers: int, address: str | None = None) -> WorkerExecutor:

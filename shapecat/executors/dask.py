@@ -16,7 +16,7 @@ _CLOSE_S = 10
 
 
 class _DaskExecutor(WorkerExecutor):
-    """The executor of a client; it also closes the client and the cluster started here."""
+    """The executor of a Dask client; it also closes the client, and the cluster started here."""
 
     def __init__(self, client: Any, cluster: Any) -> None:
         self._client, self._cluster = client, cluster

@@ -12,8 +12,8 @@ __all__ = ["WorkerExecutor"]
 class WorkerExecutor(Executor):
     """An executor as in `concurrent.futures`, which can also be ended early.
 
-    At the end of a block it waits for the tasks; after a signal it lets them stop and save results,
-    and after another error it ends them.
+    A ``with`` block ends by waiting for the tasks. If `Stopped` ends the block, the tasks may save
+    their results and stop; another error ends them.
     """
 
     def __exit__(

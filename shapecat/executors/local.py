@@ -57,7 +57,7 @@ class LocalExecutor(WorkerExecutor):
         atexit.register(self.terminate)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Queue a call; its future raises `WorkerLostError` if no worker starts, or it dies.
+        """Queue a call; its future raises `WorkerLostError` if no worker starts, or a worker dies.
 
         Raises
         ------

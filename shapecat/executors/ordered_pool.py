@@ -26,8 +26,8 @@ _ITEMS_BEFORE_START = 1
 _SENT_AHEAD = 1
 """Items sent to a busy process in advance."""
 _MOST_PER_PROCESS = 3
-"""All items that a process is given: the one it works on, one sent in advance, and one that waits
-here. A thread sends the waiting one as soon as the process finishes another, even while this
+"""Most items assigned to a process: the one it works on, one sent in advance, and one that waits
+here. As soon as the process finishes an item, a thread sends the waiting one, even while this
 process works."""
 _MOST_PENDING = 8
 """At most this many items are in progress, or wait for the result of an earlier one."""
@@ -55,8 +55,9 @@ class OrderedPool(Generic[_Item, _Result]):
 
         Parameters
         ----------
-        work : called with each item. Spawned processes need it and the items to be picklable, and
-            a script to have ``if __name__ == "__main__":``. A daemonic process works alone.
+        work : called with each item. Since other processes are spawned, it and the items must be
+            picklable, and a script needs ``if __name__ == "__main__":``.
+        count : number of processes; a daemonic process, which may start no others, works alone.
         warm_up : called in each other process before its first item.
         """
         self._work, self._warm_up = work, warm_up

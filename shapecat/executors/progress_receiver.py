@@ -1,4 +1,4 @@
-"""Progress from workers on this machine: datagrams, dropped rather than waited for."""
+"""Progress of workers on this machine, sent as datagrams, which are dropped rather than queued."""
 
 import json
 import socket

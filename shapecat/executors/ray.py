@@ -10,7 +10,7 @@ from shapecat.executors.interface import WorkerExecutor
 __all__ = ["RayExecutor"]
 
 _STORE_BYTES = 100 * 2**20
-"""Shared memory for arguments and results, which are small; Ray's default is a third of all."""
+"""Shared memory for arguments and results, which are small; Ray's default is 30 % of the memory."""
 
 
 class RayExecutor(WorkerExecutor):
@@ -44,7 +44,7 @@ class RayExecutor(WorkerExecutor):
             problem = f"--scheduler {address}: no Ray cluster answers"
             msg = f"{problem if address else '--executor ray: Ray does not start'}: {error}"
             raise ConfigError(msg) from error
-        self._call = ray.remote(max_retries=0)(_call)  # only once: the cluster keeps each one
+        self._call = ray.remote(max_retries=0)(_call)  # once: the cluster keeps each
         self._running: set[Any] = set()
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:

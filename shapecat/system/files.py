@@ -151,8 +151,8 @@ def lock(path: Path, *, wait: bool = False) -> int | None:
 
     Returns
     -------
-    The file descriptor; None if another process holds the lock, which cannot be detected on a file
-    system without locks.
+    The file descriptor; None if another process holds the lock and ``wait`` is False. On a file
+    system without locks, every call succeeds.
     """
     descriptor = os.open(path, os.O_RDONLY)
     try:
@@ -192,8 +192,8 @@ def holding(path: Path, *, wait: bool = True) -> Iterator[None]:
 def scratch_folder() -> Iterator[Path]:
     """Provide a temporary folder for the block; also remove the folders of killed processes.
 
-    Only folders of this machine are removed, since NFS does not show locks of folders to other
-    machines, and only where locks work: others may be in use.
+    A folder is removed only if this machine made it, since NFS does not show the locks of folders
+    to other machines, and only if the file system has locks; otherwise it may be in use.
     """
     prefix = f"{_SCRATCH}{socket.gethostname()}+"  # "+" never occurs in a host name, unlike "-"
     for earlier in Path(gettempdir()).glob(f"{glob.escape(prefix)}*"):
@@ -206,7 +206,7 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def _remove_unused(folder: Path) -> None:
-    """Remove a folder.
+    """Remove a folder that no process uses.
 
     Raises
     ------

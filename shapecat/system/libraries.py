@@ -8,7 +8,7 @@ from typing import Any
 __all__ = ["block_unused"]
 
 _BLOCKED_FOR = {"scipy.linalg": "numba.np.linalg", "coverage": "numba.misc.coverage_support"}
-"""Modules that are blocked for one module of numba only."""
+"""Blocked modules, each with the only module of numba for which it is blocked."""
 
 
 class _Blocker(MetaPathFinder):

@@ -39,7 +39,7 @@ def observed(
 
 
 def kernel_words(phase: str, done: int) -> str:
-    """Describe a progress report of a phase that compiles kernels; the first has 0 done.
+    """Describe a progress report of a phase that compiles kernels; ``done`` is 0 in the first.
 
     Examples
     --------

@@ -50,7 +50,10 @@ class CommonMotion:
         return replace(table, centers=centers, orientations=orientations)
 
     def moved(self, rows: I4, places: F8) -> F8:
-        """Transform positions (k, 3), metres, from the still scene into frames ``rows`` (k,)."""
+        """Transform positions (k, 3), metres, from the frame of the still objects back.
+
+        The result is in the coordinate frame of the detections in frames ``rows`` (k,).
+        """
         return np.asarray(
             np.einsum("kji,kj->ki", self.rotations[rows], places - self.translations[rows])
         )
@@ -111,7 +114,7 @@ def _extent(centers: F8) -> float:
 
 
 def _level(table: DetectionTable) -> F8:
-    """Return the rotation (3, 3) into a frame whose z axis is the mean up of the boxes."""
+    """Return the rotation (3, 3) into a frame whose z axis is the boxes' mean up direction."""
     up = np.sum([table.axes(block)[:, :, 2].sum(axis=0) for block in table.blocks()], axis=0)
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first /= np.linalg.norm(first)
@@ -139,9 +142,10 @@ def _between_neighbours(plane: C16, rows: I4, owner: I4, count: int) -> tuple[C1
 def _fit(
     observed: C16, reference: C16, rows: I4, weights: F8, turn: C16, shift: C16
 ) -> tuple[C16, C16]:
-    """Fit a rotation and a translation to each frame; keep the given ones with fewer than 2 points.
+    """Fit the rotation and the translation of each frame that map ``observed`` to ``reference``.
 
-    Points and translations in the plane are complex numbers; a rotation is one of modulus 1.
+    A frame with fewer than two points keeps its ``turn`` and ``shift``. Points and translations in
+    the plane are complex numbers; a rotation is a complex number of modulus 1.
     """
     count = len(turn)
     mean_observed = _means(observed, rows, weights, count)

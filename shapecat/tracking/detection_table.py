@@ -51,8 +51,8 @@ class DetectionTable:
     novelties : (n,) novelties of the single views.
     orientations : (n, 4) unit quaternions (x, y, z, w) of the boxes, in the frame of the centres;
         None if they are not needed.
-    described : (n,) number of the frame whose description each detection repeats, its own number
-        if it was described itself.
+    described : (n,) number of the frame from which the description of each detection was copied;
+        that of its own frame if it was not copied.
     """
 
     names: tuple[str, ...]
@@ -75,7 +75,10 @@ class DetectionTable:
         return replace(self, sizes=np.zeros((0, 3), np.float32), orientations=None)
 
     def axes(self, which: I4 | slice) -> F8:
-        """Return the axes (k, 3, 3) of the boxes of ``which``, as columns; empty if unknown."""
+        """Return the axes (k, 3, 3) of the boxes of detections ``which``, as columns.
+
+        The result is empty if the orientations are not known.
+        """
         quaternions = None if self.orientations is None else self.orientations[which]
         if quaternions is None or len(quaternions) == 0:
             return np.zeros((0, 3, 3))
@@ -106,9 +109,9 @@ class DetectionTable:
         return np.asarray(self.stamps_ns[self.rows[which]])
 
     def weights(self, track: I4) -> F8:
-        """Return the weights in the fusion (k,) of the detections of a track (k,).
+        """Return the weight (k,) that each detection of a track (k,) has in the fusion.
 
-        A repeated view counts only once.
+        Of detections with the same, copied description, only the first counts; others weigh 0.
         """
         topics = self.topics[self.rows[track]].astype(np.int64)
         _, first = np.unique((topics << 32) + self.described[track], return_index=True)
@@ -140,11 +143,10 @@ class DetectionTable:
         return np.asarray(self.centers[a] + share[:, None] * step)
 
     def frame_span(self, track: I4, max_gap_s: float) -> tuple[I4, Bool]:
-        """Return the frames (k,) from the first to the last detection of a track.
+        """Return the frames (k,) from a track's first to its last detection, and a mask (k,).
 
-        Also returns a mask (k,) of those with a detection.
-
-        Gaps longer than ``max_gap_s`` are left out, and so are topics that never see the object.
+        The mask marks the frames with a detection. Frames in gaps longer than ``max_gap_s`` are
+        left out, and so are frames of topics that never see the object.
         """
         frames = self.rows[track]
         gap_s = np.diff(self.stamps_ns[frames]) * 1e-9
@@ -165,7 +167,7 @@ class DetectionTable:
 
 
 class TableBuilder:
-    """Joins the frames of a stream, as they are read, to its `DetectionTable`.
+    """Builds the `DetectionTable` of a stream from its frames, as they are read.
 
     Columns are growing byte buffers, since joining arrays would need twice the memory.
     """
@@ -217,7 +219,7 @@ class TableBuilder:
 
 
 def _by_time(topics: I4, stamps_ns: I4) -> Any:
-    """Return the order of frames by time that keeps each topic's order of recording.
+    """Return the indices that sort frames by time but keep the order of recording in each topic.
 
     Frames that any topic recorded before its clock was set back come first.
     """

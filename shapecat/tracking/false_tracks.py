@@ -13,12 +13,12 @@ _COVERED = 0.5  # ratio of covered frames to detections above which a track is a
 
 
 def without_pieces(table: DetectionTable, tracks: Sequence[I4], max_gap_s: float) -> list[I4]:
-    """Remove tracks that are often a part of another object.
+    """Return the tracks without those that are often a part of another object.
 
-    If an object is split in some frames, the track of a piece lies, in the other frames, in the box
-    of the whole object. An object that only stands near another one, or is occluded by it, has its
-    centre outside that box. ``tracks`` are the indices (k,) of the detections of each track,
-    ascending; gaps in a track that are longer than ``max_gap_s`` are not checked.
+    If an object is split in some frames, the centre of a piece's track lies, in the other frames,
+    in the box of the whole object. An object that only stands near another one, or is occluded by
+    it, has its centre outside that box. ``tracks`` are the indices (k,) of the detections of each
+    track, ascending; gaps in a track that are longer than ``max_gap_s`` are not checked.
     """
     if table.orientations is None:
         return list(tracks)
@@ -31,7 +31,7 @@ def without_pieces(table: DetectionTable, tracks: Sequence[I4], max_gap_s: float
 
 
 def _covered(table: DetectionTable, track: I4, max_gap_s: float) -> int:
-    """Count the frames between a track's detections in which it lies in another detection's box."""
+    """Count the frames of a track without detection in which another box contains its centre."""
     rows, detected = table.frame_span(track, max_gap_s)
     others, which = table.of_frames(rows[~detected])
     place = table.positions(track, rows[~detected])[which]
@@ -39,7 +39,7 @@ def _covered(table: DetectionTable, track: I4, max_gap_s: float) -> int:
 
 
 def _covered_beside(table: DetectionTable, k: int, tracks: Sequence[I4], owner: I4) -> int:
-    """Count the frames before and after a track in which it lies in a neighbour's box.
+    """Count the frames before and after a track in which a neighbour's box contains its centre.
 
     The track is assumed to move along with the neighbour. On either side, half as many frames are
     checked as the track has detections. One side alone does not count, as an object may be put into

@@ -16,8 +16,9 @@ _PARTIAL_WEIGHT = 0.25
 """Weight of a view that is cut by the image border or an occluder, relative to a whole view."""
 
 _LENIENCE = 0.08
-"""How much the novelty limit of many views exceeds the limit of one view, so that simulated
-distractors are rejected as often from 2 to 30 views as from one (0.03 to 0.075 measured)."""
+"""The novelty limit of many views is higher than that of one view by this, so that simulated
+objects of no category are rejected as often from 2 to 30 views as from one. Measurements gave 0.03
+to 0.075."""
 
 _FLOOR = 1e-6
 """Smallest probability of a single view in a product, so that no view can veto all others."""
@@ -39,9 +40,8 @@ def fuse(posteriors: ArrayLike, method: Method = "product", weights: ArrayLike |
     Parameters
     ----------
     posteriors : (k, c) rows that sum to 1.
-    method : ``product``, tempered by the number of views, which is the normalised geometric mean;
-        ``mean``; or ``vote``, the fraction of the views that each category wins
-        (on ties, the first).
+    method : ``product``, the normalised geometric mean; ``mean``; or ``vote``, the fraction of the
+        views in which each category is the most probable one (on ties, the first).
     weights : (k,) weights of the views, the first one positive; equal by default.
 
     Returns

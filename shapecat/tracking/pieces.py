@@ -14,7 +14,7 @@ __all__ = ["join_pieces"]
 
 _NEAR_M = 0.35  # largest distance between the centres of pieces
 _SLACK, _SLACK_M = 1.1, 0.01  # factor and length by which the pieces may exceed the whole object
-_LACKING = 0.95  # some length of both pieces is less than this fraction of their joint box's
+_LACKING = 0.95  # along some axis, both pieces are shorter than this fraction of their joint box
 _MOSTLY = 0.5  # fraction of the common frames in which two tracks must be pieces
 
 
@@ -22,8 +22,8 @@ def join_pieces(table: DetectionTable, tracks: Sequence[I4]) -> list[I4]:
     """Join tracks that are pieces of one object.
 
     The size of the whole object is known from frames in which it was not split. The box around two
-    pieces is no larger than that; the box around two objects side by side is. Of two pieces in the
-    same frame, the larger one stays in the track.
+    pieces is no larger than the whole object, but the box around two objects side by side is. Of
+    two pieces in the same frame, the larger one stays in the track.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def join_pieces(table: DetectionTable, tracks: Sequence[I4]) -> list[I4]:
 
 
 def _count_fits(table: DetectionTable, tracks: Sequence[I4]) -> Counter[tuple[int, int]]:
-    """Return the number of frames in which two tracks are pieces of one object, for each pair."""
+    """Count, for each pair of tracks, the frames in which they are pieces of one object."""
     owner, counts = table.track_of_each(tracks), Counter[tuple[int, int]]()
     wholes = np.array([_wholes(table, track) for track in tracks])
     for block in table.blocks():
@@ -91,9 +91,9 @@ def _neighbours(table: DetectionTable, owner: I4, block: slice) -> I4:
 def _fit(table: DetectionTable, pairs: I4, wholes: F8) -> Bool:
     """Return the mask (p,) of pairs of detections (p, 2) that are pieces of one object.
 
-    ``wholes`` (p, 2, 3) are the lengths of the whole object from either track. The joint box of two
-    pieces is no larger than the whole object, and neither piece fills the joint box, as a bowl with
-    an object in it would.
+    ``wholes`` (p, 2, 3) are the lengths of the whole object, estimated from either track. The joint
+    box of two pieces is no larger than the whole object, and neither piece fills it, as a bowl
+    with an object in it would.
     """
     joint = np.minimum(_joint(table, pairs), _joint(table, pairs[:, ::-1]))
     lengths = sorted_sides(table.sizes[pairs.ravel()]).reshape(-1, 2, 3)

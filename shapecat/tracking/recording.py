@@ -55,7 +55,10 @@ def track_recording(
 
 @dataclass(frozen=True)
 class _Followed:
-    """A tracked stream: its detections without any common motion, and each track's detections."""
+    """A tracked stream: its detections, the detections of each track, and the common motion.
+
+    If there is a common motion, it is removed from the detections.
+    """
 
     table: DetectionTable
     tracks: list[I4]
@@ -111,7 +114,7 @@ def _associate(table: DetectionTable, cuts: Bool, settings: TrackingSettings) ->
 
 
 def _groups(labels: I4) -> list[I4]:
-    """Return the indices of each label, ascending; labels in ascending order."""
+    """Return the ascending indices of each label, for the labels in ascending order."""
     order = np.argsort(labels, kind="stable").astype(np.int32)
     return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
 
@@ -151,7 +154,7 @@ def _describe(table: DetectionTable, fragments: Sequence[I4], scenes: I4) -> Fra
 def _fused(table: DetectionTable, track: I4) -> tuple[F8, float]:
     """Return the fused posterior (c,) and novelty of detections of one object.
 
-    Fragments are compared by the product of their views, whatever the fusion of the settings.
+    Fragments are compared by the product of their views, whatever the setting ``fusion`` says.
     """
     weights = table.weights(track)
     posterior = fuse(table.posteriors[track], weights=weights)
@@ -167,9 +170,10 @@ def _extent(table: DetectionTable, track: I4) -> F8:
 
 
 def _line(table: DetectionTable, detections: I4, at: int) -> tuple[F8, F8]:
-    """Fit a constant velocity to detections; return position at ``at``, metres, and velocity, m/s.
+    """Fit a constant velocity to detections; return a position, metres, and the velocity, m/s.
 
-    A prior for standing still keeps the velocity of a few noisy points small.
+    The position is the one at detection number ``at``, the first or the last. A prior for standing
+    still keeps the velocity of a few noisy points small.
     """
     stamps, centers = table.stamps(detections), table.centers[detections]
     t = (stamps - stamps[at]) * 1e-9

@@ -41,7 +41,7 @@ class Track(Record):
     novelty: float
 
     def part(self, rows: slice) -> "Track":
-        """Return the track with only some of its rows; the values of the whole track stay."""
+        """Return the track with only some of its rows; the fields without rows stay the same."""
         columns = ("topics", "frames", "stamps_ns", "detections", "centers", "causal")
         return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 

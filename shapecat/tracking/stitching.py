@@ -22,8 +22,8 @@ _SAME_POSTERIOR = 0.5  # largest total variation distance of posteriors of the s
 _SLOW_REACH = 0.5  # fraction of the gate radius that an object at rest may seem to move
 _TOGETHER_M = 0.03  # largest difference of the displacements of objects that moved together
 _MOST = 2 / 3  # fraction of the comparable objects that must have moved together
-_PARTIAL_SLACK = 1.5  # factor of the last two limits for pairs with a partial view
-_TRUSTED = 0.4  # added to that if few views are whole, for the same position and size
+_PARTIAL_SLACK = 1.5  # factor of _SAME_POSTERIOR and _SLOW_REACH for pairs with a partial view
+_TRUSTED = 0.4  # added to _SAME_POSTERIOR for equal positions and sizes, if few views are whole
 _LOOKAHEAD = 8  # later fragments at the same position that are considered
 
 
@@ -88,7 +88,7 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
     """Return the possible links (earlier, later), the cheapest first."""
     keys = size_key(fragments.sizes)
     limit = gate_radius(keys, settings.gate_m)
-    # One side disappears behind an occluder, the other emerges.
+    # An object disappears at one side of an occluder and emerges at the other.
     hidden = 2 * gate_radius(keys, np.inf)
     size_known = fragments.whole >= _KNOWN
     vague = (fragments.whole == 0) | (fragments.novelties > 1)  # the posterior is meaningless
@@ -111,7 +111,7 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
 
 
 def _contradiction(keys: F8, other_keys: F8, size_known: Bool, other_size_known: Bool) -> F8:
-    """Return the contradictions (...) between `size_key` results (..., 3), which are broadcast.
+    """Return how much two `size_key` results (..., 3) contradict each other: (...), broadcast.
 
     An object of unknown size may be larger than seen so far, so only lengths beyond a known size
     count. ``size_known`` and ``other_size_known`` (...) say which sizes are known.
@@ -189,8 +189,9 @@ def _with_neighbours(
 ) -> Iterator[tuple[int, int, int, int, int]]:
     """Yield the frames of a topic with detections, except the first, each with four others.
 
-    These are the previous frame with detections, the previous frame, the second previous and the
-    next one with detections, -1 if there is none. ``filled`` (k,) are all frames with detections.
+    These are the last frame with detections before it, the last frame before it, the second last
+    with detections, and the next one with detections; -1 stands for a missing one. ``filled`` (k,)
+    are all frames with detections.
     """
     frames, nonempty = np.flatnonzero(table.topics == topic), filled[table.topics[filled] == topic]
     before = frames[np.searchsorted(frames, nonempty) - 1]
@@ -205,10 +206,10 @@ def _continues(
 ) -> bool:
     """Return whether frames i and j may show the same scene: at least half of the objects match.
 
-    A partial view may be smaller than its object. With ``slow``, positions and posteriors must
-    agree more closely, but less so in partial views. Alternatively, most objects, and at least two,
-    have moved together, on a belt or as seen by a moving sensor: unrelated images rarely look like
-    that.
+    A partial view may be smaller than its object. If the frames are ``slow``, that is, more than
+    0.3 s apart, positions and posteriors must agree more closely, but less so in partial views. It
+    is then also enough that most objects, and at least two, have moved together, on a belt or as
+    seen by a moving sensor: unrelated images rarely look like that.
     """
     a, b = table.of_frame(i), table.of_frame(j)
     offsets = table.centers[b][None] - table.centers[a][:, None]

@@ -39,7 +39,7 @@ class _Active:
     ids: I4
     position: F8
     velocity: F8
-    variance: F8  # of position, covariance, of velocity; the same along x, y and z
+    variance: F8  # var(position), cov(position, velocity), var(velocity); equal for x, y and z
     size: F8
     posterior: F8
     hits: I4

@@ -40,13 +40,15 @@ class Frame(Record):
     Attributes
     ----------
     topic : the stream of the recording.
-    index : number of the frame in its stream, from 0 at the selected start, including skipped ones.
+    index : number of the frame in its stream, counted from 0 at the selected start; frames that
+        are skipped count, too.
     stamp_ns : time of the measurement (``header.stamp``).
     log_time_ns : time of the recording.
     frame_id : name of the sensor frame, or of the frame that ``frame_from_sensor`` relates it to.
     depth : (h, w) metres along the optical axis; 0 where depth is missing, never NaN.
     points : (n, 3) metres, sensor frame; rows of NaN where depth is missing.
-    frame_from_sensor : pose of the sensor in the frame ``frame_id``; None if that is its own.
+    frame_from_sensor : pose of the sensor in the frame ``frame_id``; None if ``frame_id`` is the
+        sensor frame.
     """
 
     topic: str

@@ -16,7 +16,7 @@ class LabelledObject(Record):
     Attributes
     ----------
     category, confidence : final, from all views of the track.
-    box, gas : the visible part, sensor frame.
+    box, gas : box and surface of the visible part, sensor frame.
     indices : (n,) ascending indices into the frame.
     posterior : (c,) from this view alone.
     causal : (c,) fused from the track's views up to this frame.

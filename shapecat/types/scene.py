@@ -82,8 +82,8 @@ class Candidate(Record):
     plane : index in `Scene.planes` of the plane below it; None if there is none.
     on_candidate : index in `Scene.candidates` of the candidate it stands on; None if there is none.
     support_m : height of the surface it stands on above `plane`, metres; 0 on the plane itself.
-    touches_border : the border of the image, or the maximum range, cuts it off.
-    occluded : a nearer surface hides part of it.
+    touches_border : whether the border of the image, or the maximum range, cuts it off.
+    occluded : whether a nearer surface hides part of it.
     """
 
     indices: U4 = array("n", "u4")
