@@ -28,7 +28,7 @@ def _nothing(*_: object) -> None:
 
 
 def _no_cell(grid: DepthGrid, *_: object) -> Array:
-    """Return that no cell (rows, columns) is on an object."""
+    """Return a mask (rows, columns) in which no cell belongs to an object."""
     return np.zeros(grid.inverse_depth.shape, bool)
 
 
@@ -40,7 +40,8 @@ STEPS: dict[str, tuple[str, Any]] = {
     "across occlusion": ("pipeline.merge_across_occluder", _nothing),
     "hole filling": ("pipeline.fill_holes", _nothing),
 }
-"""Steps beyond the thesis, with what replaces each when it is left out."""
+"""Steps beyond the thesis. Each has a name in `shapecat.detection`, and a value that replaces the
+name when the step is left out."""
 
 
 @contextmanager

@@ -237,7 +237,7 @@ def check(folder: Path, *, recordings: int, frames: int) -> list[tuple[str, ...]
 def limits(count: int) -> tuple[str, ...]:
     """Plan synthetic recordings, record them as complete, read the manifest, and plan again.
 
-    The run.json of each is given instead of read: there are no results.
+    Return a row of the table. There are no results, so run.json is replaced by its expected keys.
     """
     first = f"kitchen_{0:07}"
     named = [

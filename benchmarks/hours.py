@@ -117,7 +117,7 @@ def _track(folder: Path) -> tuple[float, float, int]:
 
 
 def measure(frames: int) -> tuple[float, float, int]:
-    """Track a synthetic run in a process of its own; return as `_track`."""
+    """Track a synthetic run in a process of its own; return the values of `_track`."""
     with tempfile.TemporaryDirectory() as name:
         make_tables(Path(name), frames)
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:

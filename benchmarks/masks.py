@@ -3,10 +3,10 @@
     python -m benchmarks.masks --first 1000 --count 20
 
 Recordings of tables and clutter, by a Kinect or a RealSense with a colour camera beside it, are
-processed as by `shapecat process`. Two masks of each object are compared with the truth: that in
-masks.parquet, which comes from depth alone, and the exported one, whose outline follows the colour
-edges. Objects have at least `SEEN_PIXELS` pixels on the depth image and `SEEN_ON_IMAGE` on the
-colour image.
+processed as by `shapecat process`. Two masks of each object are compared with the truth: the mask
+in masks.parquet, which comes from depth alone, and the exported mask, whose outline follows the
+colour edges. Only objects with at least `SEEN_PIXELS` pixels on the depth image and `SEEN_ON_IMAGE`
+on the colour image count.
 """
 
 import json

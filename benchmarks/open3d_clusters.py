@@ -12,8 +12,8 @@ def cluster_above_plane(cloud: Any, up: Array) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    cloud : of Open3D, with points about a centimetre apart.
-    up : (3,) up direction in its frame.
+    cloud : an Open3D point cloud, whose points are about a centimetre apart.
+    up : (3,) up direction in the frame of the cloud.
 
     Returns
     -------

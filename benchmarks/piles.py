@@ -3,7 +3,8 @@
     python -m benchmarks.piles --first 740000 --count 60
     python -m benchmarks.piles --kind pile --sensor all --count 40
 
-One frame of each simulated scene of twelve objects, by a Kinect and a RealSense or by all sensors.
+Each scene has twelve objects. One frame of it is simulated for each of the sensors: a Kinect and a
+RealSense by default.
 """
 
 from pathlib import Path

@@ -2,9 +2,9 @@
 
     python -m benchmarks.planes --first 730000 --count 100
 
-One frame of each simulated table, without a given up direction. Four fifths of the table are
-covered with flat boxes, or it fills only a fifth of the image, or the camera looks down by 8 to 85
-degrees, or the table is a counter before a wall, above a cupboard.
+Detection gets one frame of each simulated table, and no up direction. Four fifths of the table are
+covered with flat boxes, or the table fills only a fifth of the image, or the camera looks down by 8
+to 85 degrees, or the table is a counter in front of a wall, above a cupboard.
 """
 
 from collections.abc import Callable, Iterator
@@ -109,7 +109,7 @@ def tilted(rng: Generator) -> World:
 
 
 def counter(rng: Generator) -> World:
-    """Look at a kitchen counter with objects; more of the wall behind it is visible than of it."""
+    """Look at a kitchen counter with objects; the wall behind fills more of the image than it."""
     table = make_table(rng, (rng.uniform(1.1, 2.0), rng.uniform(0.28, 0.55)))
     half, height = table.outline[:, :2].max(axis=0), table.height
     wall = rounded_box([2 * half[0], 0.02, height + 0.8], fine=10)

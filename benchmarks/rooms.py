@@ -64,7 +64,7 @@ def evaluate(sensor: str, seed: int, model: Categorizer, settings: Settings) -> 
 
 
 def count(detections: list[Array], labels: Array) -> Counts:
-    """Count detections, given by their pixels, by the true labels (h * w,) of these pixels."""
+    """Compare detections, given as pixel indices (k,), with the true pixel labels (h * w,)."""
     on_objects = [float(np.mean(labels[d] >= FIRST_OBJECT_LABEL)) > 0.5 for d in detections]
     seen = object_masks(labels)
     matches = match_masks(detections, seen)

@@ -188,7 +188,7 @@ class Guesser:
 
 @pytest.fixture(scope="session")
 def guessed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Process a short simulated recording; its categories are guesses. Copy it to change it."""
+    """Process a short simulated recording, with guessed categories. Tests change only copies."""
     return guess_once("guessed", tmp_path_factory, frames=8, rrd=False)
 
 
@@ -214,7 +214,7 @@ def guess_once(
 
 @pytest.fixture
 def run(guessed_run: Path, tmp_path: Path) -> Path:
-    """Return a copy of that run, to change it."""
+    """Return a copy of `guessed_run` that a test may change."""
     folder = tmp_path / "out" / "table"
     shutil.copytree(guessed_run, folder)
     return folder
@@ -222,9 +222,9 @@ def run(guessed_run: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def drawn(guessed_run: Path) -> Any:
-    """Draw the pictures of that run once; `replace` its folder by that of a copy of the run.
+    """Return the `RunReport` of `guessed_run`, whose pictures are drawn once for all tests.
 
-    Returns its `RunReport`, whose page shows the labels of the folder.
+    The page shows the labels in its ``folder``: `replace` this by the folder of a copy of the run.
     """
     from shapecat.outputs.report.writing import read_report
 
@@ -264,7 +264,7 @@ def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def reported_run(guessed_run: Path, drawn: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return that run with its report. Copy it to change it."""
+    """Return a copy of `guessed_run` with its report. Tests change only copies of it."""
     from shapecat.outputs.report.writing import Reports
 
     folder = tmp_path_factory.mktemp("reported") / "out" / "table"
@@ -286,9 +286,9 @@ def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.fixture(scope="session")
 def coloured_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Process a simulated recording with a colour camera, in four frames; categories are guesses.
+    """Process four simulated frames with a colour camera; the categories are guesses.
 
-    Copy it to change it.
+    Tests change only copies of the run.
     """
     return guess_once("coloured", tmp_path_factory, frames=4, color=True)
 

@@ -17,7 +17,7 @@ __all__ = ["FrameDetections", "frame", "gather", "track_frames"]
 class FrameDetections(Record):
     """The detections (n,) of one frame, which may have none; columns are as in `DetectionTable`.
 
-    ``detections`` are its ``numbers``. Without ``described``, all were described themselves.
+    ``detections`` are the ``numbers`` there. Without ``described``, no description was copied.
     """
 
     topic: str

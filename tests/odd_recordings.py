@@ -1,4 +1,7 @@
-"""Recordings of every format variant, damaged and unusual ones, with their expected outcomes."""
+"""Recordings of every format variant, damaged and unusual ones, with their expected outcomes.
+
+*The table* is the recording of the scene in `tests.scenes`.
+"""
 
 import json
 import os
@@ -31,7 +34,10 @@ FACTORY, FACTORY1 = MessageFactory(2), MessageFactory(1)
 
 
 class Case(NamedTuple):
-    """A recording: its writer, and the expected exit code, number of frames, and messages."""
+    """A recording: its writer, and the expected exit code, number of frames, and messages.
+
+    ``reported`` is a part of the messages; if it is empty, there must be none.
+    """
 
     write: Callable[[Path], Path]
     code: int = 0
@@ -494,4 +500,4 @@ CASES: dict[str, Case] = {
     "empty folder": Case(empty_folder, 3, 0, "no recording found"),
     "missing": Case(lambda p: p / "a.mcap", 3, 0, "does not exist"),
 }
-"""By name; ``reported`` is part of the messages, and empty if there are none."""
+"""The cases by name."""

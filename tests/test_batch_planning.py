@@ -1436,7 +1436,7 @@ def test_wrong_shard_is_refused(text: str, told: str) -> None:
 
 
 class _Answers:
-    """A claim in a storage that gives these answers, in order, whether the claim was created."""
+    """The object of a claim in a storage that gives prepared answers, one after the other."""
 
     def __init__(self, created: list[bool], contents: list[bytes | None]) -> None:
         self.created, self.contents, self.written = created, contents, list[bytes]()

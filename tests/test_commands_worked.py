@@ -458,7 +458,7 @@ CALLS = {
         "a: 1 labelled view in o\n",
     ),
 }  # fmt: skip
-"""By command line: the called function, its arguments, its result, and the printed text."""
+"""For each command line, the called function, its arguments, its result, and the printed text."""
 
 
 @pytest.mark.parametrize(

@@ -165,7 +165,10 @@ def write_truth(folder: Path) -> Path:
 
 
 def coco_text(**changes: dict[str, str]) -> str:
-    """Return COCO labels with two annotations; give values of the image, or the last, as JSON."""
+    """Return COCO labels with one image and two annotations.
+
+    ``image`` and ``annotation`` replace entries of the image and of the second annotation by JSON.
+    """
     plain = {"id": "1", "image_id": "1", "category_id": "1", "segmentation": "[[0, 0, 5, 0, 5, 5]]"}
     image = {"id": "1", "stamp_ns": "0", "height": "10", "width": "10"} | changes.get("image", {})
     last = plain | changes.get("annotation", {})

@@ -1,4 +1,4 @@
-"""Adjacency, pair features and merging of a few synthetic segments."""
+"""Tests of adjacency, pair features and merging, on a few synthetic segments."""
 
 import numpy as np
 import pytest

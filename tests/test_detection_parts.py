@@ -1,4 +1,4 @@
-"""The boosted trees of the detection: their files, their features and how they are grown."""
+"""Tests of the boosted trees of detection: their files, their features, and their training."""
 
 from pathlib import Path
 

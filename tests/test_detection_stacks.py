@@ -58,7 +58,7 @@ def test_bottle_with_level_shoulder_is_one_object() -> None:
 
 
 def another(*case: object) -> Any:
-    """Return another scene with the same hazard, whose rendering takes longer."""
+    """Return a further case of a test, which only `make test-all` runs."""
     return pytest.param(*case, marks=pytest.mark.many)
 
 

@@ -1,4 +1,4 @@
-"""Steps of the detection on small synthetic inputs with known results."""
+"""Tests of the steps of detection on small synthetic inputs with known results."""
 
 from itertools import pairwise
 

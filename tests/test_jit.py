@@ -131,7 +131,7 @@ def test_cache_folder_is_writable_or_configured(
 
 @pytest.fixture
 def no_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """Leave only the folder of temporary files, which is returned."""
+    """Make the user's cache unwritable; return the folder of temporary files, which is left."""
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
     temporary = tmp_path / "tmp"
     temporary.mkdir()

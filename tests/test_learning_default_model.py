@@ -107,7 +107,7 @@ def test_new_simulated_objects_are_recognised(model: Categorizer) -> None:
 
 @pytest.fixture(scope="module")
 def tables() -> tuple[SimulatedViews, SimulatedViews]:
-    """Simulate the same tables in order, and each as another process might: not after the first."""
+    """Simulate the same two tables in order, and in reverse order from a copy of the world."""
     sent = deepcopy(WORLD)  # as if it was pickled
     second, first = (simulate_arrangement(sent, number) for number in (1, 0))
     return collect(simulate_views(WORLD, range(2))), collect([*first, *second])

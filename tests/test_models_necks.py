@@ -1,4 +1,4 @@
-"""Splitting of the segments that the merging trees are trained on, at necks."""
+"""Tests of splitting segments at necks; the merging trees are trained on these segments."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Training data of the trees that reject background."""
+"""Tests of the training data of the trees that reject background."""
 
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Damaged containers: what is still read, and the warning or error that says what is missing."""
+"""Tests of damaged containers: intact messages are read, and a warning or error names the rest."""
 
 import errno
 import sqlite3

@@ -1,3 +1,5 @@
+"""Tests of run folders, digests of the input, locks and scratch folders: nothing is lost."""
+
 import errno
 import os
 import socket

@@ -1,3 +1,5 @@
+"""Tests of the tables of a run: columns, order, and damage that is refused."""
+
 import json
 import math
 from collections.abc import Callable

@@ -113,7 +113,7 @@ def frame_of(
     frame_id: str = "cam",
     offset: Pose | None = None,
 ) -> tuple[Perception, FrameRow]:
-    """Return a frame from the k-th place of the sensor, by default its k-th frame."""
+    """Return a frame that the sensor takes at its k-th position; its number is k by default."""
     up = ROTATIONS[k].inv().apply(UP)
     planes = (Plane(up, -0.5, OUTLINE, 0.7, 0.0), Plane(up, -0.2, OUTLINE + 1, 0.4, 0.3))
     index, stamp_ns = k if index is None else index, stamp(k) if stamp_ns is None else stamp_ns

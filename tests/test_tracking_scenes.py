@@ -56,7 +56,7 @@ def resting(place: F8, born: float = 0.0, dies: float = np.inf) -> Callable[[flo
 
 
 def place_of(item: Object) -> F8:
-    """Return where an object is that never leaves."""
+    """Return the position (3,) at time 0 of an object that is present then."""
     place = item.place(0.0)
     assert place is not None
     return place
@@ -180,7 +180,7 @@ STILL = Sensor(lambda _: np.array([0.0, -1.2, 0.6]), lambda _: np.zeros(3))
 
 
 def turntable(seed: int) -> tuple[list[Object], Sensor]:
-    """Six objects turning at a quarter radian per second."""
+    """Return six objects that turn at a quarter radian per second, and a fixed sensor."""
 
     def turning(place: F8) -> Callable[[float], F8]:
         def at(t: float) -> F8:
@@ -194,7 +194,7 @@ def turntable(seed: int) -> tuple[list[Object], Sensor]:
 
 
 def walking(seed: int) -> tuple[list[Object], Sensor]:
-    """Ten objects on a long table; the camera walks along it and back, and sees a part of it."""
+    """Return ten objects on a long table, and a camera that walks along it and sees a part."""
     random = np.random.default_rng(seed)
     objects = [
         replace(item, place=resting(place_of(item) + np.array([shift, 0, 0])))
@@ -215,7 +215,7 @@ def rolling(y: float, speed: float, start: float) -> Callable[[float], F8]:
 
 
 def crossing(seed: int) -> tuple[list[Object], Sensor]:
-    """Objects at rest, and two balls that roll to and fro in front of and between them."""
+    """Return objects at rest, two balls that roll to and fro among them, and a fixed sensor."""
     random = np.random.default_rng(seed)
     objects = table(random, 4)
     for y, speed in ((-0.45, 0.12), (-0.6, -0.15)):
@@ -225,7 +225,7 @@ def crossing(seed: int) -> tuple[list[Object], Sensor]:
 
 
 def rearranged(seed: int) -> tuple[list[Object], Sensor]:
-    """Objects that are carried elsewhere, added and removed."""
+    """Return objects that are carried elsewhere, added and removed, and a fixed sensor."""
     random = np.random.default_rng(seed)
     objects = table(random, 6)
     last = FRAMES * PERIOD_S

@@ -2,12 +2,12 @@
 
     python -m tests.mutations --only quick --count 60 --least 0.6
 
-The seed draws from all mutants, so that every machine gets the same ones, and a change of one
-module leaves those of the others. No file is changed: a mutant exists only in a forked process,
-which imports it. The test files in `JUDGED_BY` judge a module. They first run without a mutant to
-find the tests that reach each line, and files with such tests judge the mutants of a line. A mutant
-is killed if a test fails, or if the tests take far longer than without it; a mutant that no test
-reaches has survived.
+The seed ranks all mutants, so that every machine draws the same ones, and a change in one module
+does not change the mutants drawn from others. No file is changed: a mutant exists only in a forked
+process, which imports it. The test files in `JUDGED_BY` judge a module. They first run without a
+mutant to find the tests that reach each line; the files with such tests judge the mutants of the
+line. A mutant is killed if a test fails, or if the tests take far longer than without it; a mutant
+that no test reaches has survived.
 """
 
 import argparse
