@@ -163,35 +163,35 @@ def compile_all(observe: Observer = ignore, *, cores: int = 2, colour: bool = Fa
     RuntimeError : this is a worker process that runs the main script again, since the script lacks
         ``if __name__ == "__main__":``. It would wait for its parent, which waits for it.
     """
-    notes = _notes(colour=colour)
-    if notes is None or notes.exists():
+    marker = _completion_marker(colour=colour)
+    if marker is None or marker.exists():
         return 0.0
     if getattr(current_process(), "_inheriting", False):  # multiprocessing makes the same check
         msg = 'a script that processes recordings needs `if __name__ == "__main__":`'
         raise RuntimeError(msg)
     begun = time.perf_counter()
     report = _reporter(observe)
-    notes.parent.mkdir(parents=True, exist_ok=True)  # another version may have removed it
-    while (held := lock(notes.parent)) is None:
+    marker.parent.mkdir(parents=True, exist_ok=True)  # another version may have removed it
+    while (held := lock(marker.parent)) is None:
         stopping.check()
         report(WAIT_FOR_KERNELS)
         time.sleep(_POLL_S)
     try:
-        if not notes.exists():
+        if not marker.exists():
             observe(COMPILE, 0, None)
             # The rest is compiled when it is called; another version may remove the folder.
             with suppress(WorkerLostError, FileNotFoundError):
                 called = (*_REHEARSALS, find_mask) if colour else _REHEARSALS
                 _rehearse(cores, called, report)
-                notes.touch()
-                if colour and (of_depth := _notes(colour=False)) is not None:
+                marker.touch()
+                if colour and (of_depth := _completion_marker(colour=False)) is not None:
                     of_depth.touch()
     finally:
         os.close(held)
     return time.perf_counter() - begun
 
 
-def _notes(*, colour: bool) -> Path | None:
+def _completion_marker(*, colour: bool) -> Path | None:
     """Return the file that marks completion; None if machine code cannot be stored."""
     stages = (*_STAGES, "colour") if colour else _STAGES
     folders = [code_folder(Path(__file__).with_name(stage)) for stage in stages]

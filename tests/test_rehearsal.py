@@ -60,7 +60,7 @@ def mark(path: Path) -> None:
 @pytest.fixture
 def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / "trace"
-    monkeypatch.setattr(rehearsal, "_notes", lambda **_: tmp_path / "complete")
+    monkeypatch.setattr(rehearsal, "_completion_marker", lambda **_: tmp_path / "complete")
     monkeypatch.setattr(rehearsal, "_rehearse", lambda *_: mark(path))
     return path
 
@@ -81,7 +81,9 @@ def test_kernels_for_colour_are_compiled_when_needed(
     """Without them, the first colour image takes ten seconds, and in a container each time."""
     calls: list[int] = []
     monkeypatch.setattr(
-        rehearsal, "_notes", lambda *, colour: tmp_path / ("colour" if colour else "depth")
+        rehearsal,
+        "_completion_marker",
+        lambda *, colour: tmp_path / ("colour" if colour else "depth"),
     )
     monkeypatch.setattr(
         rehearsal, "_rehearse", lambda _, called, _report: calls.append(len(called))
@@ -101,7 +103,9 @@ def test_compiling_survives_removal_of_its_folder(
     trace: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """An update during a batch must not fail the remaining recordings."""
-    monkeypatch.setattr(rehearsal, "_notes", lambda **_: tmp_path / "removed" / "complete")
+    monkeypatch.setattr(
+        rehearsal, "_completion_marker", lambda **_: tmp_path / "removed" / "complete"
+    )
 
     with monkeypatch.context() as patch:
         patch.setattr(rehearsal, "_rehearse", lambda *_: shutil.rmtree(tmp_path / "removed"))
@@ -208,7 +212,7 @@ def test_compiling_processes_end() -> None:
 UNGUARDED = """{says}
 from pathlib import Path
 from shapecat import rehearsal
-rehearsal._notes = lambda **_: Path({notes!r})
+rehearsal._completion_marker = lambda **_: Path({marker!r})
 rehearsal._REHEARSALS = (int, int)
 assert rehearsal.compile_all(cores=1) > 0
 print("processed")
@@ -219,7 +223,7 @@ print("processed")
 def test_script_without_main_guard_does_not_deadlock(tmp_path: Path, says: str) -> None:
     """A compiling process would run the script again and wait for its parent's lock."""
     script = tmp_path / "script.py"
-    script.write_text(UNGUARDED.format(says=says, notes=str(tmp_path / "complete")))
+    script.write_text(UNGUARDED.format(says=says, marker=str(tmp_path / "complete")))
     ended = subprocess.run(
         [sys.executable, str(script)], capture_output=True, text=True, timeout=300, check=False
     )
