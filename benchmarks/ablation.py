@@ -40,8 +40,8 @@ STEPS: dict[str, tuple[str, Any]] = {
     "across occlusion": ("pipeline.merge_across_occluder", _nothing),
     "hole filling": ("pipeline.fill_holes", _nothing),
 }
-"""Steps beyond the thesis. Each has a name in `shapecat.detection`, and a value that replaces the
-name when the step is left out."""
+"""Steps beyond the thesis: for each, the attribute of `shapecat.detection` that does it, and the
+value that takes its place when the step is left out."""
 
 
 @contextmanager

@@ -4,9 +4,9 @@
     python -m benchmarks.cluster --check    compares the model with 1 to 4 workers on this machine
     python -m benchmarks.cluster --limits N measures planning and manifest with N recordings
 
-Measured here are the costs of sending a task to a worker with Dask, of a line of the manifest, and
-of planning a recording. The CPU time per frame is measured by `benchmarks.whole` and
-given as an option. `Assumed` lists the assumptions.
+This program measures the costs of sending a task to a worker with Dask, of a line of the manifest,
+and of planning a recording. `benchmarks.whole` measures the CPU time per frame, which is an option
+here. `Assumed` lists the assumptions.
 """
 
 import heapq

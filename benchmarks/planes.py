@@ -109,7 +109,7 @@ def tilted(rng: Generator) -> World:
 
 
 def counter(rng: Generator) -> World:
-    """Look at a kitchen counter with objects; the wall behind fills more of the image than it."""
+    """Look at a counter with objects that fills less of the image than the wall behind it."""
     table = make_table(rng, (rng.uniform(1.1, 2.0), rng.uniform(0.28, 0.55)))
     half, height = table.outline[:, :2].max(axis=0), table.height
     wall = rounded_box([2 * half[0], 0.02, height + 0.8], fine=10)

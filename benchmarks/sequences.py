@@ -216,7 +216,7 @@ def label_errors(views: Iterable[View]) -> dict[str, float]:
 
 
 def calibration(views: Iterable[View]) -> dict[int, dict[str, float]]:
-    """Return accuracy and calibration error after fusing consecutive views, by their number."""
+    """Return accuracy and calibration error after fusing consecutive views, by number of views."""
     tracks: dict[tuple[str, int, int], list[View]] = {}
     for view in views:
         tracks.setdefault(view.track, []).append(view)

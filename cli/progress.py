@@ -38,7 +38,7 @@ _SHARES = {
     "review": (0.8, 0.9),
     "annotate": (0.9, 1.0),
 }
-"""Roughly where in the work on a recording each phase begins and ends."""
+"""Rough fractions of the work on a recording that are done when a phase begins and ends."""
 
 
 def describe_plan(

@@ -94,6 +94,8 @@ def _read_perceiver(model: Path | None, model_id: str, settings: Settings) -> Pe
 
 
 class _Shape(NamedTuple):
+    """The surface of a candidate, sensor frame, its descriptor, and the seconds spent on both."""
+
     gas: NeuralGas
     descriptor: F4
     seconds: float
@@ -255,13 +257,13 @@ class _Clock:
 
 
 def find_up(frame: Frame, settings: Settings) -> F4 | None:
-    """Return the up direction (3,), sensor frame, of the supporting planes; None if too small."""
+    """Return the up direction (3,) of the planes, sensor frame; None if they are too small."""
     scene = detect(frame, settings=settings.detection, rng=_rng(settings, frame, 0))
     return scene.up if sum(plane.area_m2 for plane in scene.planes) >= _ENOUGH_M2 else None
 
 
 def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:
-    """Return a generator seeded by (seed, stamp, object), whichever worker uses it and when."""
+    """Return a generator seeded by (seed, stamp, object), independent of the order of work."""
     return np.random.default_rng((settings.seed, abs(frame.stamp_ns), item))
 
 

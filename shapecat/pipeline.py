@@ -75,7 +75,8 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
 
     Raises
     ------
-    RecordingError, NoStreamError, ModelError, OutputError : frames perceived so far are kept.
+    RecordingError, NoStreamError, ModelError, OutputError : as for the command; frames perceived so
+        far are kept.
     Stopped : a signal asked the process to stop; frames in progress are finished and kept.
     """
     begun = time.perf_counter()

@@ -55,7 +55,7 @@ def pytest_configure() -> None:
 
 
 def pytest_unconfigure() -> None:
-    """Exclude all objects from the collections at the end, which take seconds otherwise."""
+    """Exclude all objects from the garbage collections at the end, which would take seconds."""
     gc.freeze()
 
 
@@ -96,7 +96,8 @@ def real_data() -> Path:
 def shapecat() -> Callable[..., Result]:
     """Run the command as a user would, but in this process and as if the machine had one core.
 
-    Other processes would start for each short recording, and end before they had loaded.
+    With more cores, worker processes would start for each short recording, only to end before they
+    have loaded.
     """
     command: Any = import_module("shapecat.cli.main").main
 
@@ -144,7 +145,7 @@ class LateAnswer(Future[Any]):
 
 
 class LateExecutor(Executor):
-    """Replaces other processes: starts at once, and gets copies of what it is sent."""
+    """Replaces the executor of other processes: it starts at once, and works on copies."""
 
     def __init__(self, _workers: int, **_options: int) -> None:
         self._awake = False

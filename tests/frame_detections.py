@@ -41,7 +41,7 @@ def frame(
     posterior: ArrayLike = (0.9, 0.1),
     **changes: Any,
 ) -> FrameDetections:
-    """Return a frame, ten per second by default, of equal objects at given positions."""
+    """Return frame ``k``, at k / 10 seconds by default, with equal objects at some positions."""
     places = np.reshape(np.asarray(centers, float), (-1, 3))
     n = len(places)
     found = FrameDetections(

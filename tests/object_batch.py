@@ -30,8 +30,8 @@ FRAMES = 3
 class Report:
     """The outcome of a batch.
 
-    ``made`` counts how often each recording became a run; ``left`` names what lies in the bucket
-    beside runs and manifest.
+    ``made`` counts how often each recording became a run; ``left`` names the objects in the bucket
+    that belong to neither runs nor manifest.
     """
 
     code: int

@@ -219,7 +219,7 @@ def layout(kind: str) -> Callable[[Path], Path]:
 
 
 def hostile_cloud(path: Path) -> Path:
-    """Write clouds of which the first claims 2^32 points."""
+    """Write clouds; the first one claims to have 2^32 points."""
 
     def change(topic: str, message: Any) -> Any:
         if topic.endswith("points") and message.header.stamp.nanosec == 0:
@@ -231,7 +231,7 @@ def hostile_cloud(path: Path) -> Path:
 
 
 def empty_cloud(path: Path) -> Path:
-    """Write clouds of which the first has no points."""
+    """Write clouds; the first one has no points."""
 
     def change(topic: str, message: Any) -> Any:
         if topic.endswith("points") and message.header.stamp.nanosec == 0:
@@ -399,7 +399,7 @@ def text_only(path: Path) -> Path:
 
 
 def damaged_part(path: Path) -> Path:
-    """Write a folder of which one part is damaged."""
+    """Write a bag as a folder of several parts, one of which is damaged."""
     found = folder(path, StoragePlugin.SQLITE3, metadata=False)
     (found / "a.db3").rename(found / "a_0.db3")
     (found / "a_1.db3").write_bytes(b"SQLite format 3\0" + bytes(500))

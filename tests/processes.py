@@ -59,7 +59,7 @@ def obey_interrupts() -> None:
 
 
 def obey_interrupts_at_low_priority() -> None:
-    """Yield to the sender of the signal: on a busy machine, the command might end first."""
+    """Obey interrupts, and run slower than the sender, so that the command does not end first."""
     obey_interrupts()
     os.nice(10)
 

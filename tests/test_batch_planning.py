@@ -775,7 +775,7 @@ def ignore(*_: object) -> None:
 
 
 def overwritten(sources: Path, out: Path, *, most: int = 9, **changes: Any) -> dict[str, Any]:
-    """Overwrite, until ``most`` runs are complete; return the status with which each began."""
+    """Overwrite runs until ``most`` are complete; return the status that each had in the plan."""
     job = Job(Path(), Path(), mcap=False, rrd=False, overwrite=True, **changes)
     with plan_batch(job, [str(sources)], str(out)) as batch:
         list(islice(process_here(batch.tasks, ignore, manifest=batch.manifest), most))

@@ -30,7 +30,7 @@ def annotated(folder: Path) -> Boxes:
 
 
 def tables(folder: Path, *, full: bool) -> Boxes:
-    """Return the sizes and centres in the tables: full of tracks, or visible of detections."""
+    """Return sizes and centres of the full boxes of tracks, or the visible boxes of detections."""
     visible = {
         (row["frame"], row["detection"]): row["size"] + row["center"]
         for row in pq.read_table(folder / "detections.parquet").to_pylist()

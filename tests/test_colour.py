@@ -333,7 +333,7 @@ def test_masks_keep_only_holes_of_the_object() -> None:
 
 
 def masks_of_labels(labels: Any) -> tuple[Mask, ...]:
-    """Return the masks of objects 1 and 2 in a registered image; depth is missing at -1."""
+    """Return the masks of objects 1 and 2 in a registered image; at label -1, depth is missing."""
     depth, camera = np.where(labels < 0, 0, 1).astype(np.float32), Camera(40, 20, 50, 50, 20, 10)
     frame = Frame("", 0, 0, 0, "", depth=depth, camera=camera)
     return dense_masks(frame, [np.flatnonzero(labels == number) for number in (1, 2)])

@@ -50,7 +50,7 @@ UP = np.array([0.0, -1.0, 0.0])
 
 @pytest.fixture
 def run(coloured_run: Path) -> Path:
-    """Return a run with colour."""
+    """Return a copy of `coloured_run`."""
     return coloured_run
 
 

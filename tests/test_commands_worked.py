@@ -38,7 +38,7 @@ def task(name: str, status: str = "new", size: int = 0) -> Any:
 
 
 def ended(name: str, *, processed: bool | None, warnings: tuple[str, ...] = ()) -> Any:
-    """Return the outcome of a recording; without ``processed`` it failed."""
+    """Return the outcome of a recording, which failed if ``processed`` is None."""
     known = SimpleNamespace(processed=processed, warnings=warnings)
     summary = None if processed is None else known
     job = SimpleNamespace(folder=Path("out", name), place=f"out/{name}")
@@ -552,7 +552,7 @@ class _JobCollector(WorkerExecutor):
         return future
 
     def terminate(self) -> None:
-        """There are no workers."""
+        """Do nothing: there are no workers."""
 
 
 def test_workers_of_a_cluster_get_absolute_paths(

@@ -24,7 +24,7 @@ from shapecat.types import CATEGORIES, Box, FullBox
 
 TILT = np.radians(37)
 UP = np.array([0, -np.cos(TILT), -np.sin(TILT)])
-"""For a camera that looks down at 37 degrees."""
+"""Up direction for a camera that looks down at 37 degrees."""
 LEVEL = gravity_rotation(UP)
 PLACE = np.array([0.21, 1.03, -0.74])
 """Position of the object in the level frame of the camera."""

@@ -191,7 +191,7 @@ def test_as_dict_has_every_field() -> None:
 
 
 def changed(settings: Any) -> Any:
-    """Return settings of which each differs from the default."""
+    """Return settings that all differ from their defaults."""
     values: dict[str, Any] = {}
     for name, kind in get_type_hints(type(settings)).items():
         value = getattr(settings, name)

@@ -65,7 +65,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def start(arguments: list[str], begun: Path) -> "subprocess.Popen[bytes]":
     """Start a run, and wait until a file or folder appears.
 
-    It yields to this process: on a busy machine, it might end before a kill.
+    The run has a lower priority than this process, which otherwise might be too late to kill it.
     """
     running = subprocess.Popen(
         arguments,

@@ -79,7 +79,7 @@ def fused(now: F4, *earlier: tuple[F4, Pose | None]) -> F4:
 
 
 def moved(pose: Pose, other: Pose) -> Pose:
-    """Return other_from_pose."""
+    """Return the first pose in the frame of the other one."""
     turn = other.rotation.T
     return Pose(turn @ pose.rotation, turn @ (pose.translation - other.translation))
 

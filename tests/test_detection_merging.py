@@ -25,7 +25,7 @@ from tests.test_detection import Array
 
 INTRINSICS = PinholeIntrinsics(250.0, 250.0, 99.5, 74.5)
 UP = np.array([0.0, -1.0, 0.0])
-"""A camera that looks straight ahead."""
+"""Up direction for a camera that looks straight ahead."""
 VIEW = ViewGeometry(INTRINSICS.fx, UP)
 
 

@@ -30,7 +30,7 @@ from tests.test_detection import render as render_shapes
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 UP = np.array([0.0, -np.sqrt(0.5), -np.sqrt(0.5)])
-"""For a camera that looks down at 45 degrees."""
+"""Up direction for a camera that looks down at 45 degrees."""
 
 
 def block(x: float, y: float, z: float, size: tuple[float, float, float]) -> Mesh:

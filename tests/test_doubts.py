@@ -1,4 +1,4 @@
-"""Tests of the warnings about what may cost a run tracks or categories."""
+"""Tests of the warnings about causes of lost tracks and wrong categories."""
 
 import json
 from collections.abc import Callable

@@ -54,7 +54,7 @@ def relabel(folder: Path, labels: dict[int, str]) -> None:
 def boxes(folder: Path, which: str = "_full") -> dict[int, list[tuple[int, np.ndarray]]]:
     """Return for each frame the track and the corners (8, 3) of its boxes, from the tables.
 
-    Full boxes are those of the tracks, visible ones (``which`` is empty) those of the detections.
+    Full boxes are from the tracks; visible boxes (if ``which`` is empty) are from the detections.
     """
     owner = {
         (row["frame"], row["detection"]): row

@@ -38,7 +38,7 @@ from tests.kitti_files import (
 CAMERA = Camera(160, 120, 143.0, 139.0, 77.4, 61.9)
 PITCH, ROLL = np.radians(34.0), np.radians(6.0)
 LEVEL_FROM_SENSOR = Rotation.from_euler("x", -PITCH) * Rotation.from_euler("z", ROLL)
-"""From the optical frame (x right, y down, z forward) to one whose y points along gravity."""
+"""Rotation from the optical frame (x right, y down, z forward) to one with y along gravity."""
 UP = LEVEL_FROM_SENSOR.inv().apply([0, -1, 0])
 SIZE = np.array([0.31, 0.14, 0.23])
 """Length, width and height of the box."""

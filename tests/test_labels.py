@@ -56,7 +56,7 @@ def write_table(folder: Path, text: str) -> None:
 
 
 def labelled(**labels: str) -> str:
-    """Return the table with labels by track, ``t4="bowl"``."""
+    """Return the table with some labels, for example ``t4="bowl"`` for track 4."""
     text = ORIGINAL
     for track, label in labels.items():
         at = text.index(f"\n{track[1:]},") + 1

@@ -1,4 +1,4 @@
-"""Tests of tracking long recordings in batches that fit into memory."""
+"""Tests that the tracks of long recordings do not depend on the batches that save memory."""
 
 import shutil
 from pathlib import Path

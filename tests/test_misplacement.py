@@ -30,8 +30,7 @@ def write_run(
 ) -> None:
     """Write the frames of a camera that drives along x, whose frame has other ``axes`` (3, 3).
 
-    The frames ``empty`` are without objects. In each of ``cells`` equal rooms there is such a
-    camera.
+    The frames ``empty`` have no objects. There are ``cells`` equal rooms, each with such a camera.
     """
     rows: dict[str, list[Any]] = {"topic": [], "center": [], "center_fixed": [], "frame": []}
     frames = range(130)

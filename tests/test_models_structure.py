@@ -114,7 +114,10 @@ def test_a_rack_has_posts_instead_of_sides() -> None:
 
 
 def _armed(world: World, arms: str) -> Iterator[tuple[np.random.Generator, Pose, World, F4]]:
-    """Yield eight viewpoints, each with the world, arms added, and the arms' vertices (n, 3)."""
+    """Add arms to a world for eight viewpoints; yield each viewpoint, its world and the vertices.
+
+    The generator is the one that placed the arms; the vertices (n, 3) are those of the arms.
+    """
     for seed in range(8):
         rng = np.random.default_rng(seed)
         pose = random_viewpoint(world, KINECT, rng)

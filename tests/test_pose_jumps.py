@@ -30,9 +30,9 @@ def turned(yaws: F8) -> F8:
 def write_frames(
     folder: Path, places: F8, yaws: F8, numbers: I4, rate_hz: float, *, hand_s: int = 1
 ) -> None:
-    """Write the table of frames of two topics, of which the second has no pose.
+    """Write the table of the frames of two topics; only the first topic has poses.
 
-    The first one has none where its place is NaN. The second begins ``hand_s`` later.
+    It has no pose where ``places`` is NaN. The second topic begins ``hand_s`` seconds later.
     """
     with PerceptionTables(folder, categories=("can",), model_id="m") as tables:
         for number, place, turn in zip(numbers, places, turned(yaws), strict=True):

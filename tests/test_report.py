@@ -617,7 +617,7 @@ def test_corrections_made_in_browser_are_adopted(
 
 
 def changes(browser: Browser) -> dict[int, str]:
-    """Return what each changed card of the open page says about its label."""
+    """Return the text about the label on each changed card of the open page, by track."""
     script = (
         "return [...document.querySelectorAll('.card.changed')].map("
         "(card) => [+card.dataset.track, card.querySelector('.fix').textContent])"

@@ -191,7 +191,7 @@ def test_label_cleared_after_server_has_stopped_is_in_table(
 
 
 LOADED = "return performance.getEntriesByType('resource').some((got) => /labels$/.test(got.name))"
-"""A page requests the labels when it gets the focus."""
+"""Script: whether the page has requested the labels, as it does when it gets the focus."""
 TROUBLE = {
     "its answer comes late": (
         "const answer = await real(...request);"

@@ -251,7 +251,7 @@ def test_nearer_view_with_flipped_yaw_is_alike_up_to_noise(pixels: int, *, alike
 
 
 PLACE, EYE = np.array([0.7, -0.4, 0.5]), np.array([0.1, 0.3, 1.3])
-"""An object and the sensor, in the fixed frame."""
+"""Positions of an object and of the sensor, in the fixed frame."""
 LOOK = Rotation.from_euler("xyz", [-130, 12, 35], degrees=True)
 
 

@@ -76,7 +76,7 @@ def seen_at(k: int, objects: tuple[LabelledObject, ...], pixels: Any) -> ReviewF
 
 
 def contents(path: Path) -> dict[str, dict[str, Any]]:
-    """Return what is shown at the end: the last value of each column of each entity."""
+    """Return the last value of each column of each entity, which the viewer shows at the end."""
     from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
 
     found = [

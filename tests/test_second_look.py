@@ -116,7 +116,7 @@ def revised(out: Path) -> list[int]:
 
 
 def share_found(out: Path, plain: Path) -> float:
-    """Return the fraction of the plain run's detections in disturbed frames that are found."""
+    """Return the fraction of ``plain``'s detections in disturbed frames that ``out`` has, too."""
     centers: dict[tuple[int, Path], list[Any]] = {}
     for folder in (out, plain):
         for row in rows(folder, "detections", "frame", "center"):

@@ -39,7 +39,7 @@ KNOWN: dict[int, tuple[Mesh, list[np.ndarray]]] = {}
 
 
 def known_parts(mesh: Mesh) -> list[np.ndarray]:
-    """Return the convex parts of a mesh; they take longer than the physics."""
+    """Return the convex parts of a mesh; they are computed once, since this takes long."""
     if id(mesh) not in KNOWN:
         KNOWN[id(mesh)] = mesh, convex_parts(mesh)
     return KNOWN[id(mesh)][1]

@@ -45,7 +45,7 @@ ROTATIONS = Rotation.from_euler(
 )
 POSITIONS = np.array([[1.3 + 0.01 * k, -2.1, 0.6 + 0.02 * k] for k in range(FRAMES)])
 CENTERS = np.array([[3.1, 4.2, 0.7], [3.5, 4.9, 0.8], [2.6, 4.4, 0.9]])
-"""Of three objects at rest in the fixed frame, metres."""
+"""Centres of three objects at rest, in the fixed frame, metres."""
 UP = np.array([0.0, 0.0, 1.0])
 AXES = Rotation.from_euler("z", 0.6)
 POSTERIORS = np.array(
@@ -54,7 +54,7 @@ POSTERIORS = np.array(
         [[0.2, 0.7, 0.1], [0.1, 0.8, 0.1], [0.3, 0.6, 0.1]],
     ]
 )
-"""Of each object, in even and in odd frames."""
+"""Posteriors of each object, in even and in odd frames."""
 PARTIAL = [False, True, False, False, True, False]
 """Frames in which the image border cuts the first object."""
 NOVELTIES = np.array([[0.9 if cut else 0.4, 0.3, 1.2] for cut in PARTIAL])
@@ -69,7 +69,7 @@ EXTENTS = np.stack([np.cos(AROUND), np.sin(AROUND)], axis=1)
 FULL_OUTLINE = abs(EXTENTS) @ (0.035, 0.065) + EXTENTS @ (0.011, 0.004)
 """A rectangle of 0.07 m by 0.13 m with its middle at (0.011, 0.004) in the box."""
 FUSED_CENTERS = FULL_CENTERS + FULL_AXES.apply([0.011, 0.004, 0.0])
-"""Of the boxes around these outlines."""
+"""Centres of the boxes around these outlines."""
 NEURONS = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])
 OUTLINE = np.array([[0.1, 0.2, 1.3], [1.4, 0.5, 1.6], [1.7, 1.8, 1.9], [0.2, 1.1, 1.2]])
 

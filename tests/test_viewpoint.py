@@ -44,7 +44,7 @@ LINK = "camera_link"
 
 
 def posed(points: F4, quaternion: Any = (0.3, -0.6, 0.4, 0.5), place: Any = (0.3, -1.2, 0.8)) -> F4:
-    """Return points in a frame in which the camera has a pose."""
+    """Transform points of a camera to a frame in which the camera has the given pose."""
     pose = Pose(rotation_from_quaternion(quaternion), np.array(place))
     return transform(pose, points).astype(np.float32)
 

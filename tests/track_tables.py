@@ -23,7 +23,7 @@ def write_tracks(
 ) -> None:
     """Write tracks.parquet of rows (track, frame, detection); frames are a nanosecond apart.
 
-    ``topics`` are those of the rows; by default all are of one.
+    ``topics`` holds the topic of each row; by default, all rows have the same topic.
     """
     columns = {
         "track": [track for track, _, _ in rows],

@@ -74,7 +74,10 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
 
 
 def _expanded(source: str) -> list[Path]:
-    """Return the matches of a pattern, except those in a folder that matches; else the path."""
+    """Expand a pattern, unless a file has this name or nothing matches.
+
+    A match in a folder that matches, too, is left out: the search of the folder finds it.
+    """
     if os.path.lexists(source):
         return [Path(source)]
     names = glob(source, recursive=True)  # noqa: PTH207  Path.glob finds hidden files, too
@@ -90,7 +93,10 @@ def _of_path(path: Path, real: Path) -> Source:
 
 
 def _search_paths(sources: Sequence[Path]) -> tuple[dict[Path, Path], int, list[str]]:
-    """Map resolved paths to the paths of recordings; also return the files skipped, and notes."""
+    """Return the recordings at paths and below folders, the number of files skipped, and notes.
+
+    The recordings are a mapping from each resolved path to the path as it was found.
+    """
     folders = {source for source in sources if source.is_dir() and not _is_bag(source)}
     if len(sources) == 1 and not folders:
         return {_real_path(sources[0]): sources[0]}, 0, []

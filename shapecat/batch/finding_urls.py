@@ -68,7 +68,7 @@ def _search_matches(pattern: Location) -> Iterator[Source]:
 
 
 def search_url_beside_others(url: str) -> list[Source]:
-    """Return the recordings at one of several URLs.
+    """Return the recordings at a URL that is one of several sources.
 
     A URL where nothing exists is returned as a recording, and fails when it is opened, like a
     missing file. A folder without recordings is logged.
@@ -90,7 +90,7 @@ def _is_remote_folder(location: Location) -> bool:
 
 
 def stat_url(url: str) -> tuple[str, int]:
-    """Return a key of the content at a URL, and the bytes it holds; empty and 0 if unknown."""
+    """Return a key of the content at a URL, and its size in bytes; empty and 0 if unknown."""
     location = Location(url)
     with suppress(RecordingError):  # reported when it is downloaded
         info = location.info()

@@ -151,6 +151,7 @@ class RemoteManifest(Manifest):
 
         Parameters
         ----------
+        url : the folder of results.
         shard : ``I-of-N``; each shard has parts of its own. Empty without shards.
 
         Raises

@@ -24,7 +24,7 @@ COMPRESSED_HINT = "skipped: a compressed file, unpack it first"
 BAG_KEY = b"rosbag2_bagfile_information:"
 """The first line of a bag's metadata.yaml; other data sets have files of this name, too."""
 METADATA_BYTES = 1 << 12
-"""This line is looked for in this many bytes at the start of a metadata.yaml."""
+"""Number of bytes of a metadata.yaml that are searched for this line."""
 
 
 @dataclass(frozen=True, slots=True)

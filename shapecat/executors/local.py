@@ -57,7 +57,7 @@ class LocalExecutor(WorkerExecutor):
         atexit.register(self.terminate)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Queue a call; its future raises `WorkerLostError` if no worker starts, or a worker dies.
+        """Queue a call; its future raises `WorkerLostError` if its worker dies or does not start.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class LocalExecutor(WorkerExecutor):
                     task.future.cancel()
 
     def _dispatch(self, slot: int) -> None:
-        """Send tasks to the worker in a slot of the pool, or its successors, until shutdown."""
+        """Send tasks to the worker in a slot, and to workers that replace it, until shutdown."""
         resource_tracker.ensure_running()  # starting it later would unblock the signals
         signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # the workers inherit it
         capacity = threading.Semaphore(1 + self._ahead)

@@ -13,7 +13,7 @@ default of 700, walking them takes 3 % of a run."""
 def collect_seldom() -> None:
     """Collect garbage rarely, since frames leave hardly any reference cycles.
 
-    No garbage is collected when the process ends, which would take 0.6 s.
+    At the end of the process, no garbage is collected: that would take 0.6 s.
     """
     gc.set_threshold(_ALLOCATIONS)
     atexit.register(gc.freeze)

@@ -8,7 +8,7 @@ __all__ = ["forgive_stderr", "require_stdout"]
 
 
 class _Forgiving(io.TextIOWrapper):
-    """A stream that drops text that it cannot write.
+    """A stream that drops text if it cannot write it.
 
     Its methods use no global name: Python flushes stderr after it has cleared the modules.
     """

@@ -50,7 +50,7 @@ class CommonMotion:
         return replace(table, centers=centers, orientations=orientations)
 
     def moved(self, rows: I4, places: F8) -> F8:
-        """Transform positions (k, 3), metres, from the frame of the still objects back.
+        """Transform positions (k, 3), metres, back from the coordinate frame of the still objects.
 
         The result is in the coordinate frame of the detections in frames ``rows`` (k,).
         """

@@ -111,7 +111,7 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
 
 
 def _contradiction(keys: F8, other_keys: F8, size_known: Bool, other_size_known: Bool) -> F8:
-    """Return how much two `size_key` results (..., 3) contradict each other: (...), broadcast.
+    """Return how much `size_key` results (..., 3) contradict others (..., 3), broadcast to (...).
 
     An object of unknown size may be larger than seen so far, so only lengths beyond a known size
     count. ``size_known`` and ``other_size_known`` (...) say which sizes are known.
@@ -187,11 +187,11 @@ def scene_cuts(table: DetectionTable, settings: TrackingSettings) -> Bool:
 def _with_neighbours(
     table: DetectionTable, filled: I4, topic: int
 ) -> Iterator[tuple[int, int, int, int, int]]:
-    """Yield the frames of a topic with detections, except the first, each with four others.
+    """Yield each frame of a topic with detections, except the first, and four frames near it.
 
-    These are the last frame with detections before it, the last frame before it, the second last
-    with detections, and the next one with detections; -1 stands for a missing one. ``filled`` (k,)
-    are all frames with detections.
+    Before it, these are the last frame with detections, the last frame, and the second last frame
+    with detections; after it, the next frame with detections. -1 stands for a missing frame.
+    ``filled`` (k,) are all frames with detections.
     """
     frames, nonempty = np.flatnonzero(table.topics == topic), filled[table.topics[filled] == topic]
     before = frames[np.searchsorted(frames, nonempty) - 1]

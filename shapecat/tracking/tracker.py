@@ -107,7 +107,7 @@ class Tracker:
         sizes : (n, 3) metres; the third length is along the up direction.
         posteriors : (n, c) posteriors of the single views.
         partial : (n,) whether the image border or an occluder cuts the object; none by default.
-        topic : number of the sensor. Only frames of the sensor that saw an object last can miss it.
+        topic : number of the sensor. An object can be missed only by the sensor that saw it last.
 
         Returns
         -------
