@@ -69,7 +69,7 @@ EXTENTS = np.stack([np.cos(AROUND), np.sin(AROUND)], axis=1)
 FULL_OUTLINE = abs(EXTENTS) @ (0.035, 0.065) + EXTENTS @ (0.011, 0.004)
 """A rectangle of 0.07 m by 0.13 m with its middle at (0.011, 0.004) in the box."""
 FUSED_CENTERS = FULL_CENTERS + FULL_AXES.apply([0.011, 0.004, 0.0])
-"""Centres of the boxes around these outlines."""
+"""Centres of the boxes around the outlines `FULL_OUTLINE`."""
 NEURONS = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])
 OUTLINE = np.array([[0.1, 0.2, 1.3], [1.4, 0.5, 1.6], [1.7, 1.8, 1.9], [0.2, 1.1, 1.2]])
 

@@ -1,4 +1,4 @@
-"""The outcome of each recording of a batch, and its lines in the manifest."""
+"""The outcomes of the recordings of a batch, and their lines in the manifest."""
 
 import logging
 from collections.abc import Iterable, Sequence
