@@ -11,7 +11,7 @@ from shapecat.jit import kernel, unset
 __all__ = ["DOWN", "RIGHT", "SIDES", "connected_components", "span_of", "spans_of"]
 
 RIGHT, DOWN = 1, 2
-"""Bits of links: to the neighbour on the right, and to the one below."""
+"""Bits of ``links``: a cell is linked to its right neighbour, or to the one below."""
 SIDES = ((0, 1), (1, 0), (0, -1), (-1, 0))
 """Row and column offsets of the four neighbours of a cell."""
 
@@ -89,17 +89,17 @@ def _root(parent: I4, k: int) -> int:
 
 
 @kernel
-def spans_of(plane_id: I4) -> I4:
-    """Return the span (rows, 2) of each row of ``plane_id`` (rows, columns), as `span_of` does."""
-    spans = np.zeros((plane_id.shape[0], 2), np.int32)
+def spans_of(labels: I4) -> I4:
+    """Return the span (rows, 2) of each row of ``labels`` (rows, columns), as `span_of` does."""
+    spans = np.zeros((labels.shape[0], 2), np.int32)
     for i in range(len(spans)):
-        spans[i, 0], spans[i, 1] = span_of(plane_id[i])
+        spans[i, 0], spans[i, 1] = span_of(labels[i])
     return spans
 
 
 @kernel
 def span_of(row: I4) -> tuple[int, int]:
-    """Return the first column of a row (n,) with a value above 0, and one past the last.
+    """Return the first column where a row (n,) is above 0, and one past the last such column.
 
     Both are 0 if there is none.
     """

@@ -1,8 +1,8 @@
 """Depth grid: the depth image, downsampled to the working resolution of detection.
 
-All steps use inverse depth ``w = 1 / z`` (1/m): a plane is exactly linear in (column, row, w), and
-the noise of disparity cameras is constant in w, so thresholds do not depend on range, except near
-the camera.
+All steps use inverse depth ``w = 1 / z`` (1/m), for two reasons: a plane is exactly linear in
+(column, row, w), and the noise of disparity cameras is constant in w. So thresholds do not depend
+on range, except near the camera (`discontinuity_at`).
 """
 
 import math
@@ -34,20 +34,22 @@ CELL_M = 0.0035
 SMALL_M2 = 9e-4
 """Visible area of the smallest object, m²."""
 MIN_CELLS = 20.0
-"""Fewer cells may be noise."""
+"""Minimum number of cells of an object; fewer may be noise."""
 ENOUGH_CELLS = 60.0
-"""This many cells are an object, however small it is."""
+"""Upper bound of the minimum number of cells of an object; so many are enough at any depth."""
 BORDER_SHARE = 0.12
-"""Maximum fraction of the image in a blank border; a registered Kinect leaves a tenth."""
+"""Maximum width of a blank border, as a fraction of the image. A Kinect whose depth is registered
+to its colour image leaves a tenth blank."""
 STRAIGHT_SHARE = 0.3
-"""Minimum fraction of a side along which a border is straight. The top of a tall object with
-nothing behind it is no border."""
+"""Minimum fraction of a side over which the samples at the edge of a border extend. They extend
+over less where only the top of a tall object ends a blank area, which is then no border."""
 LARGEST_FACTOR = 16
 STEP_M = 0.004
-"""Smallest step between two surfaces, metres. Near the camera, a slanted surface changes from cell
-to cell by more than a `DISCONTINUITY`."""
+"""Smallest step between two surfaces, metres. It matters only near the camera, where even a slanted
+surface changes from cell to cell by more than a `DISCONTINUITY`."""
 MAX_CELLS = 100_000
-"""Maximum number of cells, to bound the time per frame; cells become larger than `CELL_M`."""
+"""Maximum number of cells, to bound the time per frame. In larger images, cells are larger than
+`CELL_M`."""
 
 
 class PinholeIntrinsics(NamedTuple):
@@ -77,10 +79,10 @@ class DepthGrid(NamedTuple):
 
 
 def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None:
-    """Average, in each cell, the depths close to the nearest one; return the inverse means.
+    """Downsample a depth image: a cell averages the depths close to its nearest depth.
 
-    Return None if no depth is within ``range_m``; in images larger than 50 pixels, only every
-    fifth row and column is searched for one.
+    Return None if no depth is within ``range_m``. If both sides of the image are longer than 50
+    pixels, this search reads only every fifth row and column.
 
     Parameters
     ----------
@@ -118,7 +120,7 @@ def discontinuity_at(depth_m: float) -> float:
 
 @kernel
 def _sampled(depth: F4, step: int, range_m: float) -> F4:
-    """Return the depths in range of every ``step``-th pixel, (n,) metres."""
+    """Return the depths in range at every ``step``-th row and column, (n,) metres."""
     rows, columns = depth.shape
     result = np.zeros((rows // step + 1) * (columns // step + 1), np.float32)
     n, one, min_depth = np.uint64(0), np.uint64(1), np.float32(NEAREST_M)
@@ -132,7 +134,7 @@ def _sampled(depth: F4, step: int, range_m: float) -> F4:
 
 @kernel(inner=True)
 def row_and_column(p: int, columns: int) -> tuple[int, int]:
-    """Return row and column of a flat cell index, without division, which takes longer."""
+    """Return row and column of a flat cell index. A multiplication replaces the slower division."""
     i = int((p + 0.5) * (1.0 / columns))
     return i, p - i * columns
 
@@ -150,7 +152,10 @@ def project(k: PinholeIntrinsics, x: float, y: float, z: float) -> tuple[int, in
 
 
 def smallest_object_at(grid: DepthGrid, depth_m: F4) -> F4:
-    """Return the number of cells that the smallest object, of `SMALL_M2`, covers at depths (n,)."""
+    """Return the number of cells (n,) that the smallest object covers at each of the depths (n,).
+
+    Its visible area is `SMALL_M2`; the result is at least `MIN_CELLS` and at most `ENOUGH_CELLS`.
+    """
     covered = SMALL_M2 * grid.intrinsics.fx**2 / depth_m.astype(np.float64) ** 2
     return np.clip(covered, MIN_CELLS, ENOUGH_CELLS).astype(np.float32)
 
@@ -164,7 +169,7 @@ def find_borders(inv_depth: F4, band: int) -> I4:
     Parameters
     ----------
     inv_depth : (rows, columns) 1/m.
-    band : number of lines, from the first with a sample, that show whether it is straight.
+    band : number of lines, from the first with a sample on, that show whether a border is straight.
 
     Returns
     -------
@@ -197,7 +202,8 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, inv_depth: F4)
     rows, columns = inv_depth.shape
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
     no_depth, min_depth = np.float32(1e9), np.float32(NEAREST_M)
-    # The pixels of a row of cells, sorted by their position in the cell, so that loops vectorise.
+    # ``parts`` are the pixels of a row of cells, grouped by their position in the cell, so that
+    # loops vectorise.
     parts = np.zeros((factor * factor, columns), np.float32)
     scratch = np.zeros((4, columns), np.float32)
     nearest, limit, total, count = scratch[0], scratch[1], scratch[2], scratch[3]

@@ -2,14 +2,14 @@
 
 1. The depth image is downsampled to samples of inverse depth; a point cloud is first turned into
    the image of a virtual camera (`depth_grid`, `virtual_camera`).
-2. `planes`: the up direction; a plane at each peak of a height histogram, by least squares or else
-   RANSAC (Fischler and Bolles 1981); the planes that support objects; the height of each sample
-   above its plane (thesis Alg. 1 and 2).
+2. `planes`: the up direction; a plane at each peak of a height histogram, by least squares or, if
+   few inliers are close to it, by RANSAC (Fischler and Bolles 1981); the planes that support
+   objects; the height of each sample above its plane (thesis Alg. 1 and 2).
 3. `foreground`: low-profile objects, walls, and objects that overhang the edge of their plane.
 4. `segmentation`: surfaces are split at depth discontinuities and concave edges (local convexity,
    Stein et al. 2014) by a watershed (Meyer 1991), and where the width of a stack changes.
-5. `merging`: segments of one object are merged, by learned relations between surface patches
-   (Richtsfeld et al. 2012, 2014), and across an object in front.
+5. `merging`: segments of one object are merged if a learned classifier of pairs says so (Richtsfeld
+   et al. 2012, 2014), or if an object in front separates them.
 6. `cleanup`: structure rejection (of walls, furniture and noise), and hole filling.
 7. `output`: boxes, support relations, labels at full resolution, the scene.
 
@@ -61,7 +61,7 @@ DEFAULT_UP = (0.0, -1.0, 0.0)
 
 
 class Task(NamedTuple):
-    """The inputs of all steps: the settings, and the generator for RANSAC."""
+    """The inputs that all steps share: the settings, and the random generator for RANSAC."""
 
     settings: DetectionSettings
     rng: np.random.Generator
@@ -78,17 +78,17 @@ def detect(
 
     Parameters
     ----------
-    frame : a depth image or a cloud. The sensor is at the origin of its frame.
-    up : (3,) direction away from gravity, sensor frame, of any length but zero. With it, only
-        planes within 15 degrees of level are considered; without it, up is estimated from the
-        dominant plane.
+    frame : a depth image or a point cloud.
+    up : (3,) direction away from gravity, sensor frame, of any length but zero. If given, only
+        planes with a normal within 15 degrees of it are considered. If None, it is estimated from
+        the dominant plane.
     settings : see `DetectionSettings`.
     rng : source of the RANSAC samples; the same state gives the same scene.
 
     Returns
     -------
-    The scene, with the planes lowest first and the objects in the order of their first point. It
-    has neither if there is no supporting plane.
+    The scene, with the planes lowest first and the objects in the order of their first point.
+    Without a supporting plane, the scene has no planes and no objects.
 
     Raises
     ------
@@ -97,9 +97,10 @@ def detect(
     Notes
     -----
     Depth images are processed in image space. A point cloud is first turned into the image of a
-    virtual camera at its origin, so that both give the same result for the same scene. If the
-    cloud was not taken from its origin, the virtual camera looks down on its dominant plane; the
-    points of a fused cloud that are hidden in that view join the objects they touch.
+    virtual camera at its origin, so that both give the same result for the same scene. If this
+    image shows no plane, because the cloud was not taken from its origin, the virtual camera looks
+    down on the dominant plane instead. In a cloud fused from several views, the points that are
+    hidden from the virtual camera join the objects they touch.
     """
     hint, task = None if up is None else unit_direction(up), Task(settings, rng)
     if frame.depth is not None and frame.camera is not None:
@@ -147,9 +148,9 @@ def _segment_view(view: VirtualImage, hint: F8 | None, task: Task) -> Segmentati
 def _segment(
     grid: DepthGrid, hint: F8 | None, task: Task, *, upright: bool = True
 ) -> Segmentation | None:
-    """Find planes and objects in a depth grid; None if there is no supporting plane.
+    """Find planes and objects in a depth grid; return None if there is no supporting plane.
 
-    ``hint`` is the up direction (3,), if it is known; ``upright`` as in `find_supporting_planes`.
+    The parameters are as in `model_planes`.
     """
     model = model_planes(grid, hint, task, upright=upright)
     if model is None:
@@ -162,9 +163,10 @@ def _segment(
 def model_planes(
     grid: DepthGrid, hint: F8 | None, task: Task, *, upright: bool = True
 ) -> PlaneModel | None:
-    """Find the planes and the samples above them (steps 2 and 3); None without supporting plane.
+    """Find the planes and the samples above them (steps 2 and 3).
 
-    The parameters are as in `_segment`.
+    Return None if there is no supporting plane. ``hint`` is the up direction (3,), a unit vector in
+    the frame of the grid, or None if unknown; ``upright`` is as in `find_supporting_planes`.
     """
     trials, settings = draw_trials(task.rng), task.settings
     result = _find_planes(grid, hint, trials, settings, upright=upright)
@@ -180,7 +182,7 @@ def model_planes(
 def _find_planes(
     grid: DepthGrid, hint: F8 | None, trials: F8, settings: DetectionSettings, *, upright: bool
 ) -> tuple[F8, Records, HeightMap] | None:
-    """Return up, the supporting planes, and the height map; None without a plane."""
+    """Return the up direction, the supporting planes, and the height map; None without a plane."""
     max_height_m = settings.max_height_m
     supports, up = find_supporting_planes(
         grid, hint, trials, max_height_m=max_height_m, upright=upright
@@ -204,10 +206,13 @@ def _find_planes(
 def _find_assumed_plane(
     grid: DepthGrid, heights: HeightMap, up: F8, trials: F8, settings: DetectionSettings
 ) -> SupportingPlane | None:
-    """Assume a plane below samples that neither planes nor walls explain; None if they are few."""
+    """Return a plane assumed below the samples that no plane and no wall explains.
+
+    Return None if such samples are few, or if the plane would be above the camera.
+    """
     unexplained = find_unexplained(grid, heights.plane_id)
     if unexplained is not None:
-        plane_id = heights.plane_id.copy()  # walls are removed only after the low-profile search
+        plane_id = heights.plane_id.copy()  # the low-profile search still needs the walls
         walls = remove_walls(grid, plane_id, up, settings.max_size_m, trials)
         unexplained = find_unexplained(grid, plane_id.view(np.uint8) | walls)
     if unexplained is None:
@@ -218,7 +223,10 @@ def _find_assumed_plane(
 def oversegment(
     grid: DepthGrid, model: PlaneModel, *, split_seeds: SeedSplitter | None = None
 ) -> OverSegmentation:
-    """Split the samples above the planes wherever two objects may meet."""
+    """Split the samples above the planes wherever two objects may meet.
+
+    ``split_seeds`` is as in `watershed`.
+    """
     heights, up = model.heights, model.up
     graph = connect_surfaces(grid, heights)
     labels, n = watershed(heights, graph, split_seeds=split_seeds)
@@ -229,7 +237,7 @@ def oversegment(
 
 
 def merge_segments(grid: DepthGrid, model: PlaneModel, oversegmentation: OverSegmentation) -> None:
-    """Merge the segments of each object, in place."""
+    """Merge the segments of each object; changes ``oversegmentation.segments`` in place."""
     graph, labels, segments = oversegmentation
     view_geometry = ViewGeometry(grid.intrinsics.fx, model.up)
     learned.merge_learned(segments, view_geometry, learned.load_trees())

@@ -36,8 +36,8 @@ class OverSegmentation(NamedTuple):
     Attributes
     ----------
     graph : the connections and normals of the samples.
-    labels : (rows, columns) int16, segments 1, 2, ..., 0 elsewhere.
-    segments : their statistics.
+    labels : (rows, columns) int16: 1, 2, ... in the segments, 0 elsewhere.
+    segments : the statistics of the segments.
     """
 
     graph: SurfaceGraph
@@ -51,8 +51,9 @@ class Segmentation(NamedTuple):
     Attributes
     ----------
     model : the planes, the samples above them, and the walls.
-    labels : (rows, columns) int16, objects 1..count, 0 elsewhere.
-    filled : (rows, columns) uint8, 1 where a labelled cell may be at the level of the plane.
+    labels : (rows, columns) int16: 1, 2, ... count on the objects, 0 elsewhere.
+    filled : (rows, columns) uint8, 1 where a labelled cell may be at the height of its plane: in a
+        filled hole or on a low-profile object.
     plane_ids : (count + 1,) index in ``model.planes`` of the plane below each object; 0 for
         label 0.
     measured : the boxes, supports and flags of the objects.

@@ -74,15 +74,16 @@ def top_view(
 ) -> VirtualImage | None:
     """Return the image of a point cloud from above its dominant plane.
 
-    It is for clouds that were not taken from their origin. The plane is the one with the most
-    points within 1 cm, of 200 planes through three random points. Its upper side is the one with
-    more points. The viewpoint is 1 m from the middle of the cloud, 45 degrees above the plane.
+    This is for clouds that were not taken from their origin. The dominant plane is the one with the
+    most points within 1 cm, of 200 planes through three random points each. Its upper side is the
+    side with more points. The viewpoint is 1 m from the middle of the cloud, in a direction 45
+    degrees above the plane.
 
     Parameters
     ----------
     points : (n, 3) metres, sensor frame; rows that are not finite are ignored.
-    hint : (3,) the up direction, if it is known. Then only planes within 15 degrees of level are
-        considered, and their upper side is the one that faces up.
+    hint : (3,) the up direction, sensor frame, or None if unknown. If given, only planes with a
+        normal within 15 degrees of it are considered, and their upper side is the one facing up.
     range_m : points farther from the origin are ignored, metres.
     rng : source of the random points.
 
@@ -109,8 +110,8 @@ def top_view(
 def _dominant_plane(sample: F8, hint: F8 | None, rng: np.random.Generator) -> F8 | None:
     """Return the upward normal (3,) of the plane with the most inliers, by RANSAC.
 
-    None if there is no plane. ``sample`` (n, 3) are points, metres; ``hint`` and the upper side are
-    as in `top_view`.
+    Return None if there is no plane. ``sample`` (n, 3) are points, metres; `top_view` explains
+    ``hint`` and which side of a plane is its upper side.
     """
     a, b, c = sample[rng.integers(0, len(sample), (3, 200))]
     normal = np.cross(b - a, c - a)
@@ -156,8 +157,9 @@ def _to_view(
 ) -> int:
     """Transform the points in view to the frame of the virtual camera; return their number.
 
-    Writes their slopes x / z and y / z to ``slopes`` (n, 2), with `OUTSIDE` for the other points,
-    and left, top, right and bottom of the slopes to ``bounds`` (4,).
+    Writes the points to ``in_view`` (n, 3), their slopes x / z and y / z to ``slopes`` (n, 2), and
+    the smallest and largest slopes to ``bounds`` (4,): left, top, right, bottom. Points out of view
+    get the slope `OUTSIDE`.
     """
     r, s = rotation, translation
     n = 0
@@ -216,10 +218,10 @@ def _render(in_view: F4, slopes: F4, bounds: F8, n: int, pose: Pose) -> VirtualI
 
 
 def _spacing(slopes: F4, bounds: F8, n: int) -> float:
-    """Return the pitch of an image in which nearly every cell of a surface has a point.
+    """Return the width of a cell, in slope, with which nearly every cell of a surface has a point.
 
-    In a fine grid every point has a cell of its own; coarser grids are tried until an occupied
-    cell holds ``POINTS_PER_CELL`` points on average.
+    In a fine grid every point has a cell of its own. Coarser grids are tried until an occupied cell
+    holds `POINTS_PER_CELL` points on average.
     """
     span = max(bounds[2] - bounds[0], bounds[3] - bounds[1], 1e-6)
     side = 1024
@@ -250,9 +252,10 @@ def _count_occupied(slopes: F4, left: float, top: float, scale: float, side: int
 def _project(
     points: F4, slopes: F4, intrinsics: PinholeIntrinsics, jump: float, inv_depth: F4, cell: I4
 ) -> int:
-    """Average the nearest points of each cell; return the number of points well behind them.
+    """Average the inverse depth of each cell's nearest points; count the points well behind them.
 
-    ``jump`` is the step in inverse depth that separates two surfaces, 1/m.
+    Writes to ``inv_depth`` and to ``cell``; returns the count. ``jump`` is the step in inverse
+    depth that separates two surfaces, 1/m.
     """
     rows, columns = inv_depth.shape
     nearest = np.zeros(inv_depth.shape, np.float32)
@@ -286,9 +289,9 @@ def _project(
 
 @kernel
 def _close_holes(inv_depth: F4, jump: float) -> None:
-    """Fill empty cells between two neighbours on one surface with their mean.
+    """Fill each empty cell that lies between two neighbours on one surface with their mean.
 
-    Neighbours are on one surface if they differ by less than ``jump``, 1/m.
+    Opposite neighbours are on one surface if they differ by less than ``jump``, 1/m.
     """
     rows, columns = inv_depth.shape
     source = inv_depth.copy()

@@ -1,7 +1,7 @@
 """Context: the classifications of a segment's neighbours.
 
-A finger of a gripper looks like an object, but it is connected to an arm. So trees that classify
-each segment alone are followed by others, which also see the classifications of its neighbours.
+A finger of a gripper looks like an object, but it is connected to an arm. So the first trees
+classify each segment alone, and the second trees also see how the first classify its neighbours.
 
 Source: auto-context (Tu 2008).
 """
@@ -19,19 +19,20 @@ _NEIGHBOURS = ("connected", "behind", "in_front", "near")
 CONTEXT_FEATURES = np.dtype(
     [
         ("object", OBJECT_FEATURES),
-        ("logit", "f4"),  # by itself; then the mean verdicts from -1, background, to 1, object,
-        *((name, "f4") for name in _NEIGHBOURS),  # on its neighbours of each kind; 0 without any
+        ("logit", "f4"),  # of the segment, classified alone
+        # The mean verdict on each kind of neighbour, from -1, background, to 1, object; 0 if none.
+        *((name, "f4") for name in _NEIGHBOURS),
     ],
     align=True,
 )
-"""The features of a segment among others."""
+"""The features of a segment, its own classification, and those of its neighbours."""
 
 
 def measure_borders(segments: Segments, roots: I4) -> F4:
-    """Return the lengths of the borders between the merged segments ``roots`` (r,).
+    """Return the lengths of the borders between all pairs of the segments ``roots`` (r,).
 
-    The result (4, r, r), in cells, is for four kinds of border: the two are connected, the second
-    is behind the first, the second is in front, and they are near but not connected.
+    The result (4, r, r), in cells, holds the four kinds of border: the two are connected, the
+    second is behind the first, the second is in front, and the two are near but not connected.
     """
     index = np.ix_(roots, roots)
     contact, in_front, near = (segments.pairs[n][index] for n in ("contact", "in_front", "near"))

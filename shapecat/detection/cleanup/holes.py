@@ -17,16 +17,17 @@ from shapecat.jit import kernel, unset
 __all__ = ["fill_holes"]
 
 BOUNDARY, IN_FRONT, CONTINUOUS = range(3)
-"""Indices of the counts of a hole's sides with a label: all, those where the label is in front of
-the hole, and those where the surface continues."""
+"""Indices of three counts of the sides that a hole shares with a label: all sides, those where the
+label is in front of the hole, and those where the surface continues."""
 
 
 @kernel
 def fill_holes(grid: DepthGrid, labels: I4, count: int, filled: U1) -> None:
-    """Give enclosed cells the label of the object around them, in place.
+    """Give the cells of holes the label of the object around them, in place.
 
-    A hole is a connected component of unlabelled samples between labels. Most of its boundary has
-    one label, and all other labels on the boundary are in front of the hole.
+    A hole is a connected component of unlabelled samples between labels. It is filled if most of
+    its boundary has one label, and all other labels on the boundary are in front of it. In
+    addition, the surface must continue into the hole, or the hole must be large.
 
     Parameters
     ----------
@@ -55,7 +56,7 @@ def fill_holes(grid: DepthGrid, labels: I4, count: int, filled: U1) -> None:
 
 @kernel(inline=True)
 def _between_labels(inv_depth: F4, labels: I4) -> tuple[Bool, I4]:
-    """Return the unlabelled samples between labels, (rows, columns) bool, and the spans of labels.
+    """Return where unlabelled samples are between labels, and the span of the labels in each row.
 
     A sample is between labels if a label lies in each of the four directions.
     """
@@ -86,11 +87,11 @@ def _count_sides(
     total: I4,
     area: I4,
 ) -> None:
-    """Count the sides and cells of the holes, in place.
+    """Count the sides and the cells of the holes, in place.
 
     ``sides`` (n, labels, 3) holds the counts `BOUNDARY`, `IN_FRONT` and `CONTINUOUS` of the sides
-    with each label; ``total`` (n,) also counts open sides. ``area`` (n,) counts cells: those
-    without depth beside a hole belong to it, and the label behind them is its neighbour.
+    with each label; ``total`` (n,) also counts sides without a label. ``area`` (n,) counts cells.
+    Cells without depth beside a hole belong to the hole; the label beyond them is its neighbour.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     for i in range(len(spans)):
@@ -125,8 +126,8 @@ def _count_label_cells(labels: I4, spans: I4, area: I4) -> None:
 def _owner_of(sides: I4, total: int, area: int, label_area: I4) -> int:
     """Return the label that a hole belongs to; 0 if there is none.
 
-    ``sides`` (labels, 3), ``total`` and ``area`` are the hole's, from `_count_sides`;
-    ``label_area`` (labels,) are numbers of cells.
+    ``sides`` (labels, 3), ``total`` and ``area`` are the counts of the hole from `_count_sides`;
+    ``label_area`` (labels,) is the number of cells of each label.
     """
     best = 0
     for k in range(1, len(sides)):

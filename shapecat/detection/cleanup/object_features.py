@@ -1,8 +1,8 @@
 """Object features: named features that distinguish objects from structure and noise.
 
-They describe a segment's shape, its ends, and the continuation of its surface: walls of bins are at
-the outline of their floor, walls of rooms continue beyond all planes, and furniture is cut off
-by the image border.
+They describe the shape of a segment, where it ends, and where its surface continues: walls of bins
+are at the outline of their floor, walls of rooms continue beyond all planes, and furniture is cut
+off by the image border.
 """
 
 import math
@@ -30,7 +30,7 @@ __all__ = ["OBJECT_FEATURES", "measure_object_features"]
 
 _SURROUNDINGS = np.dtype(
     [
-        ("image_border", "f4"),  # cells at the border, over the perimeter of a square of equal area
+        ("image_border", "f4"),  # cells there divided by the perimeter of a square of equal area
         ("range_limit", "f4"),  # fractions of the cells: at the range limit,
         ("on_wall", "f4"),  # and on walls
         ("beyond", "f4"),  # fraction of the boundary where the surface continues beyond all planes
@@ -39,9 +39,11 @@ _SURROUNDINGS = np.dtype(
         ("mean_outside_m", "f4"),
         ("most_outside_m", "f4"),
         ("low_profile", "f4"),  # fraction of the cells on low-profile objects
-        ("depth_edge", "f4"),  # fraction of the boundary in front of what is farther away
-        ("plane_height", "f4"),  # heights of the plane around it, over the minimum of an object's
-        ("plane_noise", "f4"),  # sample: their mean, and their standard deviation
+        ("depth_edge", "f4"),  # fraction of the boundary in front of farther surfaces
+        # The mean and the standard deviation of the heights of the plane's samples around the
+        # segment, divided by the minimum height of an object's sample.
+        ("plane_height", "f4"),
+        ("plane_noise", "f4"),
     ],
     align=True,
 )
@@ -52,13 +54,13 @@ _VISIBILITY = np.dtype(
         ("depth_m", "f4"),
         ("cell_m", "f4"),
         ("down", "f4"),  # cosine between the optical axis and up
-        ("top_by_noise", "f4"),  # top over the minimum height of an object's sample at that depth
-        ("slant", "f4"),  # area over that of its cells if they faced the camera
-        ("ragged", "f4"),  # squared boundary over cells: 16 for a square
+        ("top_by_noise", "f4"),  # top divided by the minimum height of a sample at that depth
+        ("slant", "f4"),  # area divided by that of the same cells if they faced the camera
+        ("ragged", "f4"),  # squared boundary divided by the number of cells: 16 for a square
     ],
     align=True,
 )
-"""The visibility of a segment."""
+"""How well a segment is visible: its size in cells, its depth, and the angle of view."""
 OBJECT_FEATURES = np.dtype(
     [("segment", SEGMENT_FEATURES), ("surroundings", _SURROUNDINGS), ("visibility", _VISIBILITY)],
     align=True,
@@ -73,7 +75,7 @@ def measure_object_features(
     oversegmentation: OverSegmentation,
     range_m: float,
 ) -> Records:
-    """Return the `OBJECT_FEATURES` (n + 1,) of merged segments.
+    """Return the `OBJECT_FEATURES` (n + 1,) of the segments after merging.
 
     Rows of segments that were merged into another are zeros. ``range_m`` is the range limit,
     metres.
@@ -90,7 +92,7 @@ class Limits(NamedTuple):
     Attributes
     ----------
     top, bottom, left, right : first and last row and column inside the blank borders of the image.
-    inverse_depth : a cell with less is at the range limit, 1/m.
+    inverse_depth : a cell with a smaller inverse depth is at the range limit, 1/m.
     """
 
     top: int
@@ -101,7 +103,7 @@ class Limits(NamedTuple):
 
 
 def _border_lines(grid: DepthGrid) -> tuple[int, int, int, int]:
-    """Return first and last row, first and last column inside the blank borders of the image."""
+    """Return the first and last row, and the first and last column, inside the blank borders."""
     rows, columns = grid.inverse_depth.shape
     top, bottom, left, right = find_borders(grid.inverse_depth, 1).tolist()
     return top, rows - 1 - bottom, left, columns - 1 - right
@@ -115,7 +117,7 @@ def _measure(
     limits: Limits,
     out: Records,
 ) -> None:
-    """Write the features of merged segments."""
+    """Write the features of the segments that were not merged into another."""
     segments, down = oversegmentation.segments, model.up[2]
     near_plane = _count_by_segment(grid, model, oversegmentation, limits, out)
     for p in range(1, segments.parent.size):
@@ -155,8 +157,8 @@ def _count_by_segment(
 ) -> F8:
     """Count the cells of each segment at borders and on walls, and where its surface continues.
 
-    Also sums the heights of the samples of planes near each segment, and their squares; returns
-    their number, (n + 1,).
+    Also sums the heights, and the squared heights, of the samples of planes near each segment.
+    Returns the number of these samples, (n + 1,).
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     _, planes, (plane_id, height), low, walls = model
@@ -199,7 +201,10 @@ def _count_by_segment(
 
 @kernel(inline=True)
 def _measure_outside(grid: DepthGrid, plane: Row, samples: I4, out: Row) -> None:
-    """Write the distance of samples outside the outline of a `PLANE`; negative inside."""
+    """Write how far samples are outside the outline of a `PLANE`: least, mean and largest distance.
+
+    The distances are in metres, negative inside.
+    """
     total, n = 0.0, 0
     for s in samples:
         if s < 0:

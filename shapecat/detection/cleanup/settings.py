@@ -1,4 +1,4 @@
-"""Tuned constants of this stage, with their units and the reason for each."""
+"""Tuned constants of the clean-up, with their units and the reason for each."""
 
 from typing import NamedTuple
 
@@ -12,39 +12,42 @@ class CleanupSettings(NamedTuple):
     """Minimum logit of an object, which is then more likely than structure. Of the segments between
     -1 and 0 that cover less than `large_share` of the image, a fifth are objects."""
     min_large_logit: float = -1.0
-    """Minimum logit of a larger object; between -1 and 0, two thirds of them are objects."""
+    """Minimum logit of an object that covers more than `large_share` of the image. Of the segments
+    that do, two thirds of those between -1 and 0 are objects."""
     far_m: float = 2.0
     """Depth beyond which most segments are background, metres."""
     min_far_logit: float = 1.0
-    """Minimum logit of an object that is far. In 160 simulated rooms, it rejects 60 of the 73 false
-    objects that a range of 3 m adds to one of 2 m, and 2 of the 57 true ones."""
+    """Minimum logit of an object that is far. In 160 simulated rooms, a range of 3 m instead of 2 m
+    adds 73 false and 57 true objects; this limit rejects 60 of the false and 2 of the true ones."""
     certain_logit: float = 4.0
-    """Absolute partial logit beyond which evaluation stops: of 1,742 segments, the remaining trees
-    would reclassify none."""
+    """If the sum of the first trees is farther from 0 than this, the other trees are not evaluated.
+    They would reclassify none of 1,742 segments."""
     uncertain_logit: float = 3.0
     """Absolute logit below which a segment is classified again in its context. Doing so for all of
     98,747 segments would change the numbers of lost and of false objects by 0.3 %."""
     sure_logit: float = 4.0
-    """Logit at which a neighbour counts three quarters of one that is certain."""
+    """Logit at which the verdict on a neighbour has three quarters of the weight of a certain
+    one."""
     tiny_share: float = 0.5
-    """Segments with a smaller fraction of the cells of the smallest object are rejected here.
-    Dropped only at the end, they would prevent the filling of the holes around them."""
+    """Segments are rejected if they have fewer cells than this fraction of the smallest object. If
+    they were rejected later, the holes around them would not be filled."""
     around_cells: int = 4
     """Distance from an object, in cells, at which the roughness of its plane is measured."""
     large_share: float = 0.02
     """Minimum fraction of the image covered by a large object, an arm, furniture or the bent end of
     a table."""
     cut_share: float = 0.4
-    """Minimum fraction of the perimeter of such structure, assumed to be square, at the image
-    border."""
+    """Fraction of the perimeter of a large segment at the image border above which it is an arm or
+    furniture. The perimeter is that of a square with the same number of cells."""
     enclosed_share: float = 0.6
-    """Minimum fraction of the boundary of a hole with the label around it: a ring seen from the
-    side has this much, the gap between two objects half."""
+    """Minimum fraction of the boundary of a hole that has the label of the object around it. For a
+    ring seen from the side it is about this, for the gap between two objects a half."""
     continuous_share: float = 0.15
-    """Minimum fraction of the boundary of a hole where the surface continues; less in a handle."""
+    """Minimum fraction of the boundary of a hole where the surface continues. For the hole of a
+    handle, the fraction is smaller."""
     mouth_share: float = 0.5
-    """Minimum area of a hole without a continuous surface, relative to the object around it: more
-    in the mouth of a cup seen from above, less in a handle."""
+    """Minimum area, relative to the object around it, of a hole into which the surface does not
+    continue. The mouth of a cup seen from above is larger, the hole of a handle smaller."""
 
 
 CLEANUP = CleanupSettings()

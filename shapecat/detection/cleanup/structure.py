@@ -43,7 +43,7 @@ class RejectionTrees(NamedTuple):
 
 
 FILES = {"structure.npz": OBJECT_FEATURES, "structure_in_context.npz": CONTEXT_FEATURES}
-"""The files of both, with their features."""
+"""The files of both kinds of trees, in the order of `RejectionTrees`, and their features."""
 
 
 @cache
@@ -63,7 +63,7 @@ def find_background(
     settings: DetectionSettings,
     trees: RejectionTrees,
 ) -> Bool:
-    """Return the merged segments to reject, as structure or for their size: (n + 1,) bool.
+    """Return which segments to reject after merging, as structure or for their size: (n + 1,) bool.
 
     ``features`` (n + 1,) are from `measure_object_features`.
     """
@@ -96,7 +96,7 @@ def as_rows(features: Records) -> F4:
 
 
 def is_uncertain(logits: F4) -> Bool:
-    """Return which segments, given their ``logits`` (n,), to classify again in context, (n,)."""
+    """Return which segments to classify again in context, (n,), from their ``logits`` (n,)."""
     uncertain: Bool = np.abs(logits) < CLEANUP.uncertain_logit
     return uncertain
 
@@ -129,7 +129,7 @@ def number_objects(parent: I4, rejected: Bool, labels: I4, spans: I4) -> I4:
     Returns
     -------
     (objects + 1,) the representative of each object: the segment that its segments are merged into;
-    0 for object 0.
+    0 for label 0.
     """
     representatives, n = np.zeros(parent.size, np.int64), 0
     numbers = np.zeros(parent.size, np.int16)

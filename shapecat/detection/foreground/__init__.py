@@ -1,1 +1,1 @@
-"""Foreground segmentation where height above the plane is not enough."""
+"""Foreground: low-profile objects, walls and overhang, where height over a plane is not enough."""

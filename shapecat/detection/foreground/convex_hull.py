@@ -19,8 +19,8 @@ def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
     ----------
     residual : (rows, columns) not 0 in low cells.
     part : (rows, columns) numbers of the parts, changed in place.
-    stack, count : the first ``count`` of ``stack`` are the flat cells of the part; the added cells
-        are appended.
+    stack, count : the first ``count`` elements of ``stack`` are the flat indices of the part's
+        cells; those of the added cells are appended.
     """
     rows, columns = residual.shape
     parts = part.reshape(-1)
@@ -50,7 +50,10 @@ def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
 
 @kernel(inner=True)
 def _straighten(side: F8, first: int, last: int) -> None:
-    """Replace one side of an outline, a column for each row, with that side of its convex hull."""
+    """Replace one side of an outline with the same side of its convex hull, in place.
+
+    ``side`` (rows,) is the column of the outline in each row.
+    """
     corners = np.zeros(side.size, np.int32)
     n = 0
     for i in range(first, last + 1):

@@ -15,25 +15,27 @@ from shapecat.jit import kernel
 __all__ = ["NOISE_STRIDE", "clear_contact", "filter_high_pass", "measure_noise", "measure_residual"]
 
 STEPS = 2**20
-"""Steps per 1/m of the integer sums: for a window full of samples 1/m off, they fit in 32 bits."""
+"""Number of integer steps per 1/m in the sums of `filter_high_pass`. A sum fits in 32 bits even if
+all samples of a window are 1/m off."""
 BIN = 2e-5
 """Width of a bin in the histogram of rises, 1/m."""
 BINS = 500
-"""Number of these bins."""
+"""Number of bins in the histogram of rises."""
 NOISE_STRIDE = 3
-"""Step between the rows and columns of the cells whose rises are counted."""
+"""Step between the rows and columns of the cells from which rises are measured."""
 
 
 @kernel
 def measure_residual(inv_depth: F4, heights: HeightMap, plane: F8, number: int, out: F4) -> int:
     """Write the smoothed inverse depth of a plane's low cells, relative to the plane; 0 elsewhere.
 
-    Returns the number of low cells, without those on the border of the image.
+    Low cells are on the plane, or less than `LowProfileSettings.low_m` above it. Returns the number
+    of low cells, without those on the border of the image.
 
     Parameters
     ----------
     inv_depth : (rows, columns) 1/m.
-    plane : (3,) a, b, c of its inverse depth.
+    plane : (3,) a, b, c of the plane's inverse depth.
     number : number of the plane, from 1, as in `HeightMap.plane_id`.
     out : (rows, columns) 1/m, written in place.
     """
@@ -73,10 +75,10 @@ def measure_residual(inv_depth: F4, heights: HeightMap, plane: F8, number: int, 
 def _find_low(
     inv_depth: F4, heights: HeightMap, plane: F8, number: int, i: int, raw: F4, mark: F4
 ) -> bool:
-    """Write the inverse depth of the low cells of row ``i`` relative to the plane, and a mark of 1.
+    """Write the low cells of row ``i``: their inverse depth relative to the plane, and a mark of 1.
 
-    ``raw`` and ``mark`` (3, columns) hold the last three rows; other cells are 0. Returns whether
-    the row has low cells.
+    ``raw`` and ``mark`` (3, columns) hold both for the last three rows, and 0 in the other cells.
+    Returns whether the row has low cells.
     """
     plane_id, height = heights
     zero, one, low = np.float32(0), np.float32(1), np.float32(LOW.low_m)
@@ -97,9 +99,9 @@ def _find_low(
 def clear_contact(
     inv_depth: F4, heights: HeightMap, number: int, jump: float, residual: F4, stack: I4, drop: F4
 ) -> None:
-    """Set the residual to 0 on the steep foot of higher objects.
+    """Set the residual to 0 where the low cells at the foot of a higher object are steep.
 
-    From the cells of a higher object, low cells are followed downwards as long as they fall
+    From the cells of a higher object, the search follows low cells downwards as long as they fall
     steeply.
 
     Parameters
@@ -191,7 +193,7 @@ def _slide(residual: F4, i: int, sign: int, sums: I4, counts: I4) -> None:
 
 @kernel(inline=True)
 def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
-    """Write the sums over the window around each column, and the counts, at least 1."""
+    """Write the sum over the window around each column, and the number of low cells, at least 1."""
     width = 2 * LOW.window + 1
     window = number = np.int32(0)
     for j in range(width):
@@ -205,10 +207,11 @@ def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
 
 @kernel
 def measure_noise(high_pass: F4, plane_id: I4, number: int) -> float:
-    """Return the median rise, 1/m, between cells of a plane that are `LOW.rise_cells` cells apart.
+    """Return the median rise on a plane, 1/m.
 
-    ``high_pass`` (rows, columns), 1/m, is from `filter_high_pass`; ``number``, from 1, is the
-    plane's number in ``plane_id`` (rows, columns), as in `HeightMap`.
+    A rise is the change of ``high_pass`` over `LOW.rise_cells` cells. ``high_pass`` (rows,
+    columns), 1/m, is from `filter_high_pass`; ``number``, from 1, is the plane's number in
+    ``plane_id`` (rows, columns), as in `HeightMap`.
     """
     rows, columns = high_pass.shape
     histogram = np.zeros(BINS, np.int64)

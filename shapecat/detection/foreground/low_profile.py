@@ -28,7 +28,7 @@ from shapecat.jit import kernel, unset
 __all__ = ["find_low_profile"]
 
 CELLS_PER_BLOCK = 16
-"""Cells that are tested together: most are below all levels."""
+"""Number of cells in a block; one test skips a block whose cells are all below the lowest level."""
 
 
 class Scratch(NamedTuple):
@@ -38,7 +38,7 @@ class Scratch(NamedTuple):
     ----------
     flooded : (rows, columns) int32, the number of the last part that was flooded at each cell.
     part : (rows, columns) int32, the number of the last part whose filled hull holds each cell.
-    seeds, stack : (cells,) int32, lists of flat cells.
+    seeds, stack : (cells,) int32, lists of flat cell indices.
     """
 
     flooded: I4
@@ -51,7 +51,7 @@ class Scratch(NamedTuple):
 def find_low_profile(
     grid: DepthGrid, heights: HeightMap, planes: Records, max_size_m: float
 ) -> Bool:
-    """Find the low-profile objects on each plane, and assign depth error to the plane.
+    """Find the low-profile objects on each plane; assign cells with mere depth error to the plane.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def find_low_profile(
 def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
     """Return the first row of the cells of a plane, and one past the last, with a margin.
 
-    They are equal if there is no cell. All neighbours that are read lie within the margin.
+    The two are equal if there is no cell. All neighbours that are read lie within the margin.
     """
     rows = plane_id.shape[0]
     above, on = np.int8(number), np.int8(-number)
@@ -185,7 +185,7 @@ def _mark_objects(
 def _find_seeds(high_pass: F4, threshold: float, seeds: I4) -> int:
     """List the cells above ``threshold`` that are higher than their left and upper neighbours.
 
-    They include the first cell of every part above any level. Returns their number. Most cells are
+    The first cell of every part above any level is among them. Returns their number. Most cells are
     below ``threshold``, so a vectorised test skips whole blocks.
     """
     rows, columns = high_pass.shape
@@ -215,9 +215,10 @@ def _find_seeds(high_pass: F4, threshold: float, seeds: I4) -> int:
 
 @kernel(inner=True)
 def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) -> int:
-    """Set ``part`` to ``n`` in the connected cells above ``level``; return their number.
+    """Set ``part`` to ``n`` in the cells above ``level`` that are connected with ``start``.
 
-    ``residual`` must be 0 at the border of the image.
+    Lists these cells in ``stack`` and returns their number. ``start`` is a flat index; ``residual``
+    must be 0 at the border of the image.
     """
     columns = residual.shape[1]
     flat, parts = residual.reshape(-1), part.reshape(-1)
@@ -247,9 +248,10 @@ def _drop_error(
     parts: int,
     scratch: Scratch,
 ) -> int:
-    """Assign flat parts of low object cells to the plane if their outline shows depth error.
+    """Assign the parts of the remaining low cells to the plane if their outline shows depth error.
 
-    The parts are numbered from ``parts`` + 1; the last number is returned.
+    Cells on the side of an object are left out. The parts are numbered from ``parts`` + 1; the last
+    number is returned.
     """
     rows, columns = residual.shape
     _, part, seeds, stack = scratch
@@ -285,7 +287,7 @@ def _drop_error(
 
 @kernel(inline=True)
 def _is_flat(residual: F4, i: int, j: int) -> bool:
-    """Return whether a low cell is not on the side of an object."""
+    """Return whether the surface is flat around a low cell, unlike on the side of an object."""
     rows, columns = residual.shape
     value = residual[i, j]
     for di, dj in SIDES:

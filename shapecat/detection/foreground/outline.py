@@ -1,4 +1,4 @@
-"""Outlines of low parts of a plane: an object has a step along it, depth error does not."""
+"""Outlines of low parts: the outline of an object is a step, that of depth error is not."""
 
 from typing import NamedTuple
 
@@ -30,7 +30,7 @@ class Limits(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """Counts of the sides of cells along an outline.
+    """Counts of the sides of an outline: each lies between a cell of the part and one outside.
 
     Attributes
     ----------
@@ -54,8 +54,8 @@ class Outline(NamedTuple):
 def width_of_part(inv_depth: F4, stack: I4, count: int) -> float:
     """Return the width of a part along the rows, in cells at a depth of 1 m.
 
-    ``inv_depth`` is (rows, columns), 1/m; the first ``count`` of ``stack`` are the flat cells of
-    the part.
+    ``inv_depth`` is (rows, columns), 1/m; the first ``count`` elements of ``stack`` are the flat
+    indices of the part's cells.
     """
     columns = inv_depth.shape[1]
     first, last = columns, 0
@@ -98,8 +98,10 @@ def measure_outline(
     residual : (rows, columns) 1/m above the plane; 0 where a cell is not low.
     plane_id : (rows, columns) as in `HeightMap`.
     part : (rows, columns) numbers of the parts.
-    stack, count : the first ``count`` of ``stack`` are the flat cells of this part.
-    number : number of its plane, from 1, as in ``plane_id``.
+    stack, count : the first ``count`` elements of ``stack`` are the flat indices of this part's
+        cells.
+    number : number of the plane, from 1, as in ``plane_id``.
+    limits : the limits for parts of this plane.
     """
     rows, columns = residual.shape
     parts = part.reshape(-1)

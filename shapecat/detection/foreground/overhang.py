@@ -31,8 +31,8 @@ class Overhang(NamedTuple):
     ----------
     grid, heights, walls : as in `extend_overhang`.
     number : number of the plane, from 1, as in `HeightMap.plane_id`.
-    plane : its record of `PLANE`.
-    max_height_m : maximum height of an object above it, metres.
+    plane : the `PLANE` itself.
+    max_height_m : maximum height of an object above the plane, metres.
     visited : (rows, columns) int8, ``number`` in the cells already visited for this plane.
     """
 
@@ -82,7 +82,7 @@ def _find_border(plane_id: I4, number: int, i: int, border: U1) -> bool:
     """
     rows, columns = plane_id.shape
     row_above, row_below, one = max(i - 1, 0), min(i + 1, rows - 1), np.uint64(1)
-    plane = np.uint8(number)  # as unsigned numbers, cells on a surface are larger
+    plane = np.uint8(number)  # the negative ids of surfaces become large unsigned numbers
     for j in range(np.uint64(columns)):
         lower = (np.uint8(plane_id[row_above, j]) < plane) | (
             np.uint8(plane_id[row_below, j]) < plane
@@ -118,7 +118,7 @@ def _continues(over: Overhang, i: int, j: int) -> bool:
 
 @kernel(inline=True)
 def _extend(over: Overhang, i: int, j: int, stack: I4) -> None:
-    """Assign the outside part of the object at cell (i, j) to its plane, unless it is too large."""
+    """Assign the outside part of the object at cell (i, j) to the plane, unless it is too large."""
     inv_depth, plane_id, number = over.grid.inverse_depth, over.heights.plane_id, over.number
     rows, columns = inv_depth.shape
     stack[0], over.visited[i, j] = i * columns + j, number
@@ -147,7 +147,7 @@ def _extend(over: Overhang, i: int, j: int, stack: I4) -> None:
 
 @kernel(inner=True)
 def _height_beside(over: Overhang, i: int, j: int) -> float:
-    """Return the height of a cell above the plane, metres; 0 if no object on it can be there."""
+    """Return the height of a cell above the plane, metres; 0 if no object can extend there."""
     inv_depth, k, plane = over.grid.inverse_depth[i, j], over.grid.intrinsics, over.plane
     if inv_depth <= 0 or over.walls[i, j] == CLEARED:
         return 0.0

@@ -9,17 +9,20 @@ class LowProfileSettings(NamedTuple):
     """Constants that distinguish low-profile objects from low-frequency depth error."""
 
     levels: tuple[float, ...] = (3.0, 2.0, 1.3, 0.9, 0.6)
-    """Thresholds above the mean whose outlines are tested, as multiples of the minimum rise: one
-    of them separates an object from the depth error beside it."""
+    """Thresholds above the local mean, as multiples of `Limits.level`. The outlines of the parts
+    above each are tested: one threshold separates an object from the depth error beside it."""
     fine: float = 0.006
-    """Upper bound of that minimum rise, 1/m: more is not noise but a plane at a grazing angle."""
+    """Upper bound of `Limits.level`, 1/m: larger rises come not from noise but from a plane at a
+    grazing angle."""
     step: float = 0.002
-    """Minimum mean rise across the outline of an object, 1/m: less than a step of a Kinect."""
+    """Minimum mean rise across the outline of an object, 1/m: less than a disparity step of a
+    Kinect."""
     noise_factor: float = 3.5
-    """Minimum rise as a multiple of the median rise between plane cells equally far apart."""
+    """Minimum mean rise of an object, as a multiple of the median rise on the plane over the same
+    number of cells."""
     slope_share: float = 0.7
-    """Minimum rise as a fraction of the plane's change per cell: at a grazing angle, slightly
-    displaced samples seem to rise."""
+    """Minimum mean rise of an object, as a fraction of the plane's change per cell: at a grazing
+    angle, slightly displaced samples seem to rise."""
     grown: float = 0.95
     """A part replaces the objects within it if its mean rise is more than this fraction of their
     largest mean rise. A part that combines an object with depth error rises less."""
@@ -28,7 +31,7 @@ class LowProfileSettings(NamedTuple):
     slope: float = 0.0016
     """Minimum fall per cell on the side of an object, 1/m."""
     max_overlap: float = 0.9
-    """A part with a larger fraction of its cells in objects already marked is not tested again."""
+    """A part is not tested if a larger fraction of its cells belongs to objects already found."""
     min_cells: int = 80
     """Minimum number of cells of a low-profile object: smaller parts are noise."""
     small_part: int = 12
@@ -36,11 +39,13 @@ class LowProfileSettings(NamedTuple):
     facing_share: float = 0.3
     """Minimum fraction of the outline of depth error that faces the plane."""
     low_m: float = 0.03
-    """Cells higher than this belong to objects anyway, metres."""
+    """Cells higher than this belong to objects in any case, metres."""
     window: int = 20
-    """Half the window of the mean, in cells: wider than a rim, narrower than a wave of error."""
+    """Half the width of the window of the local mean, in cells: wider than a rim, narrower than a
+    wave of error."""
     max_value: float = 0.006
-    """Upper bound of a cell's value in the mean, 1/m: an object must not cause a pit around it."""
+    """Upper bound of a cell's value in the local mean, 1/m: an object must not cause a pit around
+    it."""
     rise_cells: int = 5
     """Distance, in cells, over which rises are measured, both of noise and of outlines."""
 
@@ -51,13 +56,12 @@ class OutlineSettings(NamedTuple):
     steep: float = 0.5
     """Minimum rise of a steep side, relative to the minimum mean rise: more than noise."""
     steep_share: float = 0.7
-    """Minimum fraction of steep sides among those that face the plane."""
+    """Minimum fraction of steep sides among the sides of an object that face the plane."""
     max_rise: float = 3
     """Upper bound of the rise of one side, relative to the minimum mean rise."""
     all_around: float = 0.75
-    """Minimum sum of the rises over the number of sides, including those that do not face the
-    plane.
-    """
+    """Minimum ratio of the sum of the rises to the number of all sides, including those that do not
+    face the plane."""
     chance: float = 16
     """Short outlines need more evidence: the required mean rise is multiplied by
     1 + ``chance`` / sides."""
@@ -72,8 +76,8 @@ class OutlineSettings(NamedTuple):
     broad: float = 1.5
     """Cells per side above which a part may be partly hidden: strips beside objects have fewer."""
     ragged: float = 80
-    """Largest ratio of squared number of sides to number of cells, for a part that hardly faces the
-    plane: 16 for a square, 50 for a crescent."""
+    """Largest ratio sides² / cells of a part that hardly faces the plane. The ratio of a square is
+    16, that of a crescent 50."""
 
 
 class WallSettings(NamedTuple):
@@ -92,11 +96,12 @@ class WallSettings(NamedTuple):
     cleared_m2: float = 0.1
     """Minimum area of all cleared parts together."""
     free_share: float = 0.25
-    """Minimum fraction of the left and right ends of a part in front of farther surface, for the
-    front of an object; it has half if one flank is visible too."""
+    """Minimum fraction of the left and right ends of a part that are in front of a farther surface,
+    if the part is the front of an object. If a side of the object is visible too, the fraction is
+    about a half."""
     filled: float = 0.3
-    """Minimum fraction of its extent that a wall fills: the front edges of a shelf are also in one
-    plane."""
+    """Minimum fraction of its extent that a wall fills. The front edges of a shelf, which are also
+    in one plane, fill less."""
     strip_m: float = 0.05
     """Width of the strips whose areas give the extent of a wall, metres."""
 
@@ -107,7 +112,7 @@ class OverhangSettings(NamedTuple):
     max_distance_m: float = 0.15
     """Largest distance of an object's cell from the outline, metres."""
     outside_ratio: float = 5
-    """Largest ratio of an object's cells outside to those inside."""
+    """Largest ratio of the number of an object's cells outside the outline to those inside."""
 
 
 LOW, OUTLINES = LowProfileSettings(), OutlineSettings()

@@ -19,7 +19,7 @@ ON_WALL, CLEARED = 1, 2
 """Marks of cells on a wall: in a small part, which may be an object in the plane of the wall; and
 in a large part, which is removed from the objects."""
 UNMEASURED = 3
-"""Mark of cells on a wall whose part is not measured yet."""
+"""Mark of cells on a wall, in a connected part that is not measured yet."""
 
 STRIPS = 400
 """Number of strips of `WallSettings.strip_m`, half on each side of the sensor."""
@@ -68,7 +68,7 @@ def _is_wall(
     up: F8,
     max_size_m: float,
 ) -> bool:
-    """Return whether the inliers of a plane are too many for the face of an object."""
+    """Return whether the inliers of a plane fill an area that is too large for an object."""
     strips = np.zeros((2, STRIPS))
     area = _measure(intrinsics, samples, plane, normal, up, strips)
     across = along = 0.0
@@ -108,7 +108,7 @@ def _clear(
 ) -> None:
     """Clear the large connected parts of a wall; other parts may be objects in front of it.
 
-    ``axes`` (3, 3) are its normal, the horizontal direction along it, and up.
+    ``axes`` (3, 3) are the normal of the wall, the horizontal direction along it, and up.
     """
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
@@ -135,8 +135,8 @@ def _clear(
 def _is_free_standing(grid: DepthGrid, axes: F8, max_size_m: float, state: U1, cells: I4) -> bool:
     """Return whether a connected part of a wall is the front of one of several objects in a row.
 
-    It is no larger than an object, and ends to the left and right in front of farther surface. A
-    wall ends behind a nearer surface or in a corner.
+    Such a front is no larger than an object, and ends to the left and right in front of a farther
+    surface. A wall ends behind a nearer surface or in a corner. ``axes`` are as in `_clear`.
     """
     inv_depth, k = grid.inverse_depth, grid.intrinsics
     (rows, columns), (_, side, up) = inv_depth.shape, axes
@@ -164,7 +164,7 @@ def _is_free_standing(grid: DepthGrid, axes: F8, max_size_m: float, state: U1, c
 
 @kernel(inline=True)
 def _flood(grid: DepthGrid, normal: F8, i: int, j: int, state: U1, stack: I4) -> tuple[int, float]:
-    """Collect the connected part of a wall at cell (i, j).
+    """Mark the connected part of a wall at cell (i, j) as `ON_WALL`; list its cells in ``stack``.
 
     Returns the number of cells and their area, m².
     """

@@ -48,7 +48,7 @@ def merge_across_occluder(segments: Segments, grid: DepthGrid, normal: F4, label
 
 @kernel(inline=True)
 def _find_shared_occluder(segments: Segments) -> Bool:
-    """Return which segments p < q share an occluder and a supporting plane, (n + 1, n + 1) bool."""
+    """Return which pairs of segments p < q share an occluder and a plane, (n + 1, n + 1) bool."""
     pairs, parent, plane_id = segments.pairs, segments.parent, segments.plane_id
     n = parent.size
     same_occluder = np.zeros((n, n), np.bool_)
@@ -88,8 +88,9 @@ def _local_planes(samples: I4, grid: DepthGrid, normal: F4) -> F8:
 def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
     """Find the pairs of samples of two segments that lie in each other's local planes.
 
-    Returns the smaller of the two segments' fractions of samples with a partner, and the positions
-    of some of the pairs, (n, 2, 3). ``a`` and ``b`` are from `_local_planes`.
+    A fraction of the samples of each segment has a partner in the other. Returns the smaller of the
+    two fractions, and the positions (n, 2, 3) of some of the pairs. ``a`` and ``b`` are from
+    `_local_planes`.
     """
     with_a, with_b = np.zeros(a.shape[1], np.bool_), np.zeros(b.shape[1], np.bool_)
     pairs = np.zeros((SAMPLES * SAMPLES, 2), np.uint8)
@@ -122,7 +123,10 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
 
 @kernel(inline=True)
 def _is_hidden(segments: Segments, p: int, q: int, grid: DepthGrid, labels: I4, lines: F8) -> bool:
-    """Return whether lines (n, 2, 3) between two segments run behind an occluder."""
+    """Return whether an occluder hides the lines (n, 2, 3) between two segments, at least in part.
+
+    Hardly any of the lines may run through free space.
+    """
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     free = hidden = measured = 0
     for k in range(len(lines)):

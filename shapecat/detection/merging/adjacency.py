@@ -66,7 +66,7 @@ def measure_adjacency(
 
 @kernel(inline=True)
 def _find_changes(links: U1, row: I4, row_below: I4, change: U1) -> bool:
-    """Mark the cells of a row from which a segment does not continue both to the right and down.
+    """Mark the cells of a row whose segment does not continue both to the right and down.
 
     Returns whether there are any such cells.
     """
@@ -93,9 +93,10 @@ def _count(
 ) -> None:
     """Add pairs of cells on a boundary to the counts of the segments on both sides.
 
-    The first cells are in row ``row``. ``border`` (n, 6) holds their column; row and column of the
-    second; 1 if the second is below the first, 0 if it is to the right; the number of cells without
-    a depth between them; and not 0 if the surface continues.
+    The first cell of each pair is in row ``row``. The columns of ``border`` (n, 6) are the column
+    of the first cell; the row and the column of the second; 1 if the second is below the first, 0
+    if it is to the right; the number of cells without depth between the two; and a number that is 0
+    unless the surface continues from one to the other.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     plane_id, height = heights.plane_id, heights.height

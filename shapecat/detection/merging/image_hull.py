@@ -1,4 +1,7 @@
-"""Convex hulls of segments in the image, as support functions that merge by their maximum."""
+"""Convex hulls of segments in the image, as support functions.
+
+The support function of the hull around two hulls is the maximum of theirs.
+"""
 
 import math
 

@@ -73,8 +73,8 @@ def _rate(
 ) -> None:
     """Write the logits that ``p`` is one object with each segment from ``first`` on.
 
-    In ``logits`` (n + 1, n + 1), the smaller segment is the row; -inf if not adjacent. ``pair``
-    (1,) is work space for the features of a pair, which the trees read as numbers.
+    In ``logits`` (n + 1, n + 1), the row is the smaller of the two segment numbers; the logit is
+    -inf if the two are not adjacent. ``pair`` (1,) is work space for the features of a pair.
     """
     adjacent, values = find_adjacent(segments, p, view_geometry), pair.view(np.float32)
     for q in range(first, adjacent.size):

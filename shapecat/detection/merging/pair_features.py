@@ -50,7 +50,7 @@ _ADJACENCY = np.dtype(
         ("along_second", "f4"),
         ("second_faces_up", "f4"),  # fractions of the contact beyond which the other faces up
         ("first_faces_up", "f4"),
-        ("above_second_m", "f4"),  # mean height of that contact above the other's top
+        ("above_second_m", "f4"),  # mean height of that contact above the top of the other
         ("above_first_m", "f4"),
         ("border_m", "f4"),
         ("concavity_deg", "f4"),  # mean concave angle of the contact
@@ -62,10 +62,10 @@ _RELATION = np.dtype(
     [
         ("area_ratio", "f4"),
         ("width_ratio", "f4"),
-        ("lateral_distance", "f4"),  # over the larger width
+        ("lateral_distance", "f4"),  # divided by the larger width
         ("depth_difference_m", "f4"),
-        ("depth_difference", "f4"),  # over the larger width
-        ("overlap", "f4"),  # of the lateral ranges, over the smaller width
+        ("depth_difference", "f4"),  # divided by the larger width
+        ("overlap", "f4"),  # of the lateral ranges, divided by the smaller width
         ("top_over_top_m", "f4"),
         ("bottom_over_top_m", "f4"),
         ("other_bottom_over_top_m", "f4"),
@@ -77,10 +77,10 @@ _RELATION = np.dtype(
         ("normal_cos", "f4"),  # cosine between the mean normals
         ("second_off_first_m", "f4"),  # distance of the middle of one from the mean plane of the
         ("first_off_second_m", "f4"),  # other, positive in front of it
-        ("first_convexity", "f4"),  # cells over those of the convex hull
+        ("first_convexity", "f4"),  # number of cells divided by the area of their convex hull
         ("second_convexity", "f4"),
         ("both_convexity", "f4"),
-        ("hull_growth", "f4"),  # convex hull of both over those of each
+        ("hull_growth", "f4"),  # area of the hull of both divided by the sum of each hull's area
         ("cells", "f4"),  # of the first
         ("cell_m", "f4"),
         ("down", "f4"),  # cosine between the optical axis and up
@@ -97,13 +97,13 @@ PAIR_FEATURES = np.dtype(
     ],
     align=True,
 )
-"""The features of two segments, the smaller one first; all are float32, lengths in metres or
-ratios. The trees index them in this order. One record serves pair after pair, so that each field is
-written for every pair."""
+"""The features of two segments, the one with the smaller area first; all are float32, lengths in
+metres or ratios. The trees index them in this order. All pairs of a frame use the same record, so
+each pair must write every field."""
 
 
 class ViewGeometry(NamedTuple):
-    """The view of the scene.
+    """The focal length and the up direction of the view, for the features of pairs.
 
     Attributes
     ----------
@@ -119,7 +119,8 @@ class ViewGeometry(NamedTuple):
 def find_adjacent(segments: Segments, p: int, view_geometry: ViewGeometry) -> Bool:
     """Return which segments may be one object with segment ``p``: (n + 1,) bool.
 
-    They are above the same plane as ``p``, and touch, occlude or face it, or are occluded by it.
+    Such a segment is above the same plane as ``p``, and is near ``p`` or touches, occludes or faces
+    it, or is occluded by it.
     """
     pairs, parent, plane_id = segments.pairs, segments.parent, segments.plane_id
     adjacent = np.zeros(parent.size, np.bool_)
@@ -135,8 +136,8 @@ def find_adjacent(segments: Segments, p: int, view_geometry: ViewGeometry) -> Bo
 def _face(segments: Segments, p: int, q: int, view_geometry: ViewGeometry) -> bool:
     """Return whether two segments may be the near and the far wall of a pot, which do not touch.
 
-    They are one behind the other along their line of sight, which is not the optical axis: seen
-    from above, the walls of a pot at the left of the image are to the left and right.
+    One wall is behind the other along the line of sight to them. This is not the optical axis: if
+    the camera looks down, the walls of a pot at the left of the image are side by side.
     """
     a, b = segments.statistics[p], segments.statistics[q]
     if abs(a.top - b.top) >= MERGING.facing_m:
@@ -181,7 +182,7 @@ def write_pair_features(
 ) -> None:
     """Write the features of segments ``p`` and ``q`` to ``out``.
 
-    ``features`` (n + 1,) are the segments' own.
+    ``features`` (n + 1,) are the `SEGMENT_FEATURES` of single segments.
     """
     area_p, area_q = segments.statistics[p].area, segments.statistics[q].area
     if area_p > area_q or (area_p == area_q and p > q):
@@ -228,7 +229,7 @@ def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) 
 
 @kernel(inner=True)
 def _above_top(segments: Segments, p: int, q: int) -> float:
-    """Return the mean height at which ``p`` rests on ``q``, above the top of ``q``, metres."""
+    """Return the mean height, above the top of ``q``, at which ``p`` rests on ``q``, metres."""
     contact = segments.pairs[p, q].rests_on
     if contact == 0:
         return MERGING.no_contact_m

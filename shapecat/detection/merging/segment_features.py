@@ -35,10 +35,10 @@ SEGMENT_FEATURES = np.dtype(
         ("touching", "f4"),
         ("in_front", "f4"),
         ("behind", "f4"),
-        ("top_area", "f4"),  # over the squared width
+        ("top_area", "f4"),  # divided by the squared width
         ("facing_up", "f4"),  # fraction of the area
         ("area_m2", "f4"),
-        ("filled", "f4"),  # area over width times height
+        ("filled", "f4"),  # area divided by width times height
     ],
     align=True,
 )
@@ -80,7 +80,7 @@ def normal_position_correlation(row: Row) -> float:
 
 @kernel(inner=True)
 def _moments(row: Row) -> tuple[float, float, float]:
-    """Return the centred sums of lateral position squared, normal squared, and their product."""
+    """Return the centred sums of x², n² and x n, for lateral position x and lateral normal n."""
     n = max(row.fitted, np.float32(1))
     spread = row.xx_sum - row.x_sum * row.x_sum / n
     turning = row.normal_xx_sum - row.normal_x_sum * row.normal_x_sum / n

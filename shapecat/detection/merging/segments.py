@@ -1,4 +1,4 @@
-"""Segments: the statistics of each segment and of each pair (`adjacency` adds the latter)."""
+"""Segments: the statistics of each segment, and of each pair, which `adjacency` measures."""
 
 import math
 from typing import Any, NamedTuple
@@ -59,11 +59,11 @@ SEGMENT = np.dtype(
 )
 """The statistics of a segment."""
 _MINIMA = 2
-"""The index at which its minima end."""
+"""Number of fields of a `SEGMENT`, at its start, that are minima."""
 _MAXIMA = 4
-"""The index at which its maxima end."""
+"""Index of the first field after the maxima, which follow the minima."""
 _FIELDS = SEGMENT.itemsize // 4
-"""The number of its fields."""
+"""Number of fields of a `SEGMENT`."""
 PAIR = np.dtype(
     [
         ("contact", "f4"),  # linked neighbours
@@ -77,23 +77,23 @@ PAIR = np.dtype(
 )
 """The statistics of an ordered pair of segments: counts along their common border."""
 MIN_LINKS = 3
-"""Minimum of such a count that is not noise."""
+"""Minimum count along a border; smaller counts are noise."""
 SAMPLES = 48
 """Maximum number of samples of a segment, evenly spaced, used where all its cells would take too
 long."""
 
 
 class Segments(NamedTuple):
-    """Statistics of segments 1..n; row 0 is unused. A merge adds up all but the samples.
+    """Statistics of segments 1..n; row 0 is unused. `merge` combines those of two segments.
 
     Attributes
     ----------
     pairs : (n + 1, n + 1) records of `PAIR`.
     statistics : (n + 1,) records of `SEGMENT`.
-    top_area : (n + 1, BANDS) float32, area of upward-facing surface by height, m2.
+    top_area : (n + 1, BANDS) float32, area of upward-facing surface in each band of height, m2.
     hulls : (n + 1, DIRECTIONS) float32, support functions of the convex hulls in the image, cells.
-    samples : (n + 1, SAMPLES) int32, flat cells away from edges; -1 beyond the last.
-    plane_id : (n + 1,) int8, the plane below each, as in `HeightMap.plane_id`.
+    samples : (n + 1, SAMPLES) int32, flat indices of cells away from edges; -1 beyond the last.
+    plane_id : (n + 1,) int8, the plane below each segment, as in `HeightMap.plane_id`.
     parent : (n + 1,) int16, the segment that each has been merged into, at first itself.
     """
 
@@ -219,7 +219,7 @@ def _measure(
 
 @kernel
 def merge(segments: Segments, p: int, q: int) -> None:
-    """Merge segment ``q`` into segment ``p``, in place; both must be roots."""
+    """Merge segment ``q`` into ``p``, in place; neither may already be merged into another."""
     n, pairs, hulls = segments.parent.size, segments.pairs.view(np.float32), segments.hulls
     fields = pairs.shape[1] // n
     for k in range(n * fields):
@@ -236,7 +236,7 @@ def merge(segments: Segments, p: int, q: int) -> None:
     for d in range(DIRECTIONS):
         hulls[p, d] = max(hulls[p, d], hulls[q, d])
     add_statistics(segments.statistics, p, q)
-    # Half of the samples from each side.
+    # The samples of both alternate until there are enough.
     samples, first, count = segments.samples, segments.samples[p].copy(), 0
     for k in range(2 * SAMPLES):
         cell = samples[q, k // 2] if k % 2 else first[k // 2]

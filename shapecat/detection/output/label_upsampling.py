@@ -24,9 +24,10 @@ __all__ = [
 ]
 
 UNSURE, BARE = -1, -2
-"""Codes in place of a label: a closer test is needed; an unlabelled cell next to a labelled one."""
+"""Codes in place of a label. `UNSURE`: a closer test is needed. `BARE`: an unlabelled cell is next
+to a labelled one."""
 PIXELS_PER_BLOCK = 16
-"""Pixels that are tested together: most are like the previous ones."""
+"""Number of pixels that one vectorised test covers; most are like the previous ones."""
 
 
 def label_pixels(
@@ -34,8 +35,9 @@ def label_pixels(
 ) -> list[U4]:
     """Return the pixels of each label 1, 2, ...: ascending flat indices (k,) uint32.
 
-    A pixel takes the label of its cell if their depths agree, else the label of the neighbour whose
-    depth agrees best. It keeps the label only if it is above the plane or in a filled cell.
+    A pixel takes the label of its cell if their depths agree, else the label of the neighbouring
+    cell whose depth agrees best. The pixel keeps that label only if it is above the plane or in a
+    filled cell.
 
     Parameters
     ----------
@@ -63,7 +65,7 @@ def dilate_row(labels: I4, i: int, scratch: I4, dilated: I4) -> None:
 def _list_pixels(
     depth: F4, grid: DepthGrid, segmentation: Segmentation, range_m: float
 ) -> tuple[U4, I4]:
-    """Return the pixels of each label, as `pixels_by_label` does."""
+    """Return the pixels of each label, in the form that `pixels_by_label` returns."""
     inv_depth, factor = grid.inverse_depth, grid.factor
     rows, columns = inv_depth.shape
     height, width = depth.shape
@@ -164,7 +166,7 @@ def _code_cells(grid: DepthGrid, segmentation: Segmentation) -> tuple[I4, I4]:
 def _find_high(planes: Records, inv_depth: F4, jump: float, i: int, span: I4, high: U1) -> None:
     """Write whether all pixels that fit a cell are above each plane, for a span of row i.
 
-    A pixel fits within ``jump``, 1/m.
+    A pixel fits a cell if their inverse depths differ by less than ``jump``, 1/m.
     """
     zero, floor = np.float32(0), np.float32(1e-3)
     base = np.float32(FRINGE * HEIGHT_NOISE)
@@ -214,9 +216,9 @@ def _mark(
 ) -> None:
     """Write the labels of a run of pixels, `UNSURE` where a closer test is needed.
 
-    ``run`` is the row, the first column, and one past the last; ``inv_depth`` and ``code`` hold the
-    values of the cells for each pixel column; a pixel fits a cell within ``jump``, 1/m. This
-    vectorises.
+    ``run`` is the row, the first column, and one past the last. ``inv_depth`` and ``code`` hold the
+    values of the cells for each pixel column. A pixel fits a cell if their inverse depths differ by
+    less than ``jump``, 1/m. The loop vectorises.
     """
     min_depth, zero = np.float32(NEAREST_M), np.int16(0)
     unsure, bare = np.int16(UNSURE), np.int16(BARE)

@@ -18,11 +18,13 @@ __all__ = ["ObjectMeasurements", "measure_objects"]
 class Boxes(NamedTuple):
     """The boxes of the objects 1..n, in 3D and in the image, one row each.
 
+    The view frame is the frame of the virtual camera; for a depth image, it is the sensor frame.
+
     Attributes
     ----------
     center, size : (n, 3) metres, of the upright box, view frame.
     orientation : (n, 4) quaternion x, y, z, w of the box, view frame.
-    low, high : (n, 2) the first and last row and column of the cells of each.
+    low, high : (n, 2) the first, and the last, row and column of the cells of each object.
     """
 
     center: F8
@@ -42,12 +44,12 @@ class ObjectMeasurements(NamedTuple):
 
     Attributes
     ----------
-    boxes : their boxes.
-    supported_by : (n,) the label of the object that each stands on; 0 for its plane.
-    support_m : (n,) the height of that support above the plane.
-    occluded : (n,) whether a nearer surface hides part of it.
-    at_range_limit : (n,) whether the range limit cuts it off.
-    min_cells : (n,) float32, number of cells of the smallest object at its depth.
+    boxes : the boxes of the objects.
+    supported_by : (n,) the label of the object that each object stands on; 0 for its plane.
+    support_m : (n,) the height of that support above the plane, metres.
+    occluded : (n,) whether a nearer surface hides part of the object.
+    at_range_limit : (n,) whether the range limit cuts the object off.
+    min_cells : (n,) float32, number of cells of the smallest object at the depth of this one.
     """
 
     boxes: Boxes
@@ -67,10 +69,10 @@ def measure_objects(
     up: F8,
     plane_offsets: F8,
 ) -> ObjectMeasurements:
-    """Measure the objects.
+    """Measure the boxes, the supports and the flags of the objects.
 
-    The box is a `shapecat.geometry.upright_box` around the outermost cells. Where an object touches
-    its plane, the box reaches down to it.
+    A box is a `shapecat.geometry.upright_box` around the outermost cells of an object. If the
+    object touches its plane, the box reaches down to the plane.
 
     Parameters
     ----------
@@ -100,10 +102,11 @@ def measure_objects(
 
 
 def _extend_to_planes(boxes: Boxes, standing: Bool, up: F8, plane_offsets: F8) -> None:
-    """Extend boxes down to the planes, in place: their lowest millimetres are labelled as plane.
+    """Extend boxes down to their planes, in place.
 
-    ``standing`` (n,) are the objects that touch their plane; ``up`` (3,) and ``plane_offsets``
-    (n,), metres, are as in `measure_objects`.
+    The lowest millimetres of an object are labelled as plane. ``standing`` (n,) are the objects
+    that touch their plane; ``up`` (3,) and ``plane_offsets`` (n,), metres, are as in
+    `measure_objects`.
     """
     gaps = boxes.center @ up - boxes.size[:, 2] / 2 - plane_offsets
     gaps[~standing | (gaps < 0) | (gaps > OUTPUT.lifted_m)] = 0
@@ -115,9 +118,8 @@ def _extend_to_planes(boxes: Boxes, standing: Bool, up: F8, plane_offsets: F8) -
 def _find_supports(segments: Segments, representatives: I4, boxes: Boxes, up: F8) -> tuple[I4, F8]:
     """Return the label below each object (n,), 0 for its plane; and the height there, metres.
 
-    An object stands on another if it is over it, and has more contact with the other's
-    upward-facing surface than with the plane. If the contact is hidden, its bottom must be at the
-    top of the other one.
+    Object A stands on object B if A is over B, and has more contact with the upward-facing surface
+    of B than with the plane. If that contact is hidden, the bottom of A must be at the top of B.
     """
     count = representatives.size - 1
     supported_by, support_m = np.zeros(count, np.int64), np.zeros(count)
@@ -132,10 +134,10 @@ def _find_supports(segments: Segments, representatives: I4, boxes: Boxes, up: F8
 
 @kernel(inline=True)
 def _objects_below(boxes: Boxes, up: F8, k: int) -> Bool:
-    """Return which labels, (n + 1,), have the middle of object ``k`` above them, seen from above.
+    """Return for each label, (n + 1,), whether the middle of object ``k`` is over that object.
 
-    An object may extend a little behind its visible part. An object whose middle is farther behind
-    stands behind it, even if its visible part begins at the top of the other.
+    An object may extend a little behind its visible part. If the middle of ``k`` is farther behind,
+    ``k`` stands behind the object, even if the visible part of ``k`` begins at the object's top.
     """
     count = boxes.center.shape[0]
     below = np.zeros(count + 1, np.bool_)
@@ -190,9 +192,9 @@ def _supporting_object(
 
 @kernel(inline=True)
 def _hidden_support(segments: Segments, representatives: I4, p: int, below: Bool) -> int:
-    """Return the label that has the most contact with a segment from below; 0 if there is none.
+    """Return the label that has the most contact with segment ``p`` from below; 0 if there is none.
 
-    A segment that lies mostly below the top of another one is not on it, but behind it.
+    A segment that lies mostly below the top of an object is not on the object, but behind it.
     """
     statistics, pairs = segments.statistics, segments.pairs
     max_overlap = min(OUTPUT.overlap_m, (statistics[p].top - statistics[p].bottom) / 2)
@@ -224,7 +226,7 @@ def _break_cycles(supported_by: I4, support_m: F8) -> None:
 
 @kernel(fast=True)
 def _measure_boxes(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> None:
-    """Write the boxes; ``level`` (3, 3) is the level frame in the view frame, row by row."""
+    """Write the boxes; the rows of ``level`` (3, 3) are the level axes in the view frame."""
     points, start = _outer_points(grid, labels, level, boxes)
     for k in range(start.size - 1):
         if start[k] < start[k + 1]:
@@ -239,8 +241,8 @@ def _measure_boxes(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> None
 def _outer_points(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> tuple[F4, I4]:
     """Return points of each object in the level frame (3, n), and the index where each begins.
 
-    The points are the outermost cells, and every 4th cell inside, since the nearest point of a ball
-    is inside its outline. Also writes ``low`` and ``high``.
+    The points are the outermost cells, and the cells inside at every 4th row and column, since the
+    nearest point of a ball is inside its outline. Also writes ``boxes.low`` and ``boxes.high``.
     """
     rows, columns = labels.shape
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
@@ -280,7 +282,10 @@ def _outer_points(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> tuple
 
 @kernel(inner=True)
 def _find_outer(labels: I4, i: int, first: int, end: int, outer: Bool) -> None:
-    """Mark the labelled cells in part of a row that are next to other labels, and every 4th."""
+    """Mark the labelled cells in part of row ``i`` that are next to other labels.
+
+    In every 4th row, every 4th labelled cell is marked too.
+    """
     rows, columns = labels.shape
     if i == 0 or i == rows - 1:
         for j in range(first, end):

@@ -14,7 +14,7 @@ __all__ = ["label_occluded_points"]
 
 
 def label_occluded_points(points: F4, labels: I4, first_new: int) -> I4:
-    """Label all points: labels spread to the unlabelled points that touch labelled ones.
+    """Label all points: labels spread to unlabelled points that touch labelled ones.
 
     Points touch if their voxels of 1 cm share at least a corner. Labels spread one voxel
     at a time, so that the nearest object wins.

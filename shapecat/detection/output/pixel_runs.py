@@ -12,7 +12,7 @@ __all__ = ["append_run", "pixels_by_label", "split_by_label"]
 
 @kernel(inner=True)
 def append_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
-    """Append a run of pixels to the first ``n`` rows of ``runs``; return their new number.
+    """Append a run of pixels after the first ``n`` rows of ``runs``; return the new number of rows.
 
     ``runs`` is as in `pixels_by_label`; a run whose label is 0 is left out.
     """
@@ -26,8 +26,8 @@ def append_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
 def pixels_by_label(runs: I4, labels: int) -> tuple[U4, I4]:
     """Return the pixel indices (n,) of runs, sorted by label, and where each label ends (labels,).
 
-    ``runs`` is (r, 3): label, first pixel, and one past the last. Label 0 has no pixels: its end
-    is 0.
+    ``runs`` is (r, 3): label, first pixel, and one past the last. ``labels`` is the number of
+    labels, with label 0, which has no pixels: its end is 0.
     """
     offset, total = np.zeros(labels, np.int64), 0  # where the next pixel of each label goes
     for r in range(len(runs)):

@@ -25,7 +25,8 @@ def label_points(
     """Return the points of each label 1, 2, ...: ascending indices (k,) uint32.
 
     If ``fused``, points behind the visible surface, at most ``max_height_m`` above a plane, join
-    the objects they touch. Lists beyond the labels are clusters that touch no visible object.
+    the objects they touch. Those that touch no visible object form clusters, which are further
+    lists at the end.
     """
     points, grid, labels = view.points, view.grid, segmentation.plane_ids.size
     marks = np.zeros(len(points), np.int16)
@@ -77,7 +78,7 @@ def _mark_points(
 ) -> None:
     """Write the labels of points (n, 3) in the view frame to ``marks`` (n,).
 
-    ``cell`` (n,) is the flat cell of each point; -1 out of view.
+    ``cell`` (n,) is the flat index of each point's cell; -1 out of view.
     """
     intrinsics, columns = grid.intrinsics, grid.inverse_depth.shape[1]
     dilated = _dilate(segmentation.labels).reshape(-1)

@@ -39,8 +39,8 @@ def build_scene(
 
     Parameters
     ----------
-    indices : for each label from 1, the ascending indices of its points in the frame. Lists beyond
-        the labels are objects that the view does not show.
+    indices : for each label from 1, the ascending indices of its points in the frame. Further lists
+        are objects that the view does not show.
     sensor_from_view : pose of the virtual camera in the sensor frame; `IDENTITY` for an image.
     points : (n, 3) metres, view frame, for the boxes of objects that the view does not show; None
         for an image.
@@ -59,7 +59,7 @@ def build_scene(
     def is_object(k: int) -> bool:
         if k >= visible_count:
             return _has_object_size(boxes[k], settings)
-        # Without a visible plane below it, what the border cuts off is probably furniture.
+        # An object that the border cuts off and that has no visible plane is probably furniture.
         return plane_id[k] is not None or not truncated[k]
 
     selected = [k for k in selected if is_object(k)]
@@ -97,7 +97,7 @@ def _select_objects(
     *,
     image: bool,
 ) -> list[int]:
-    """Return which lists in ``indices`` have enough points for an object, by their first points."""
+    """Return which lists in ``indices`` have enough points, in the order of their first points."""
     limits = [float(min_points)] * len(indices)
     if image:
         limits = [max(min_points, n * grid.factor**2) for n in measured.min_cells.tolist()]
@@ -106,9 +106,9 @@ def _select_objects(
 
 
 def _has_object_size(box: Box, settings: DetectionSettings) -> bool:
-    """Return whether a hidden object has the size of one, not of a wall or furniture.
+    """Return whether a hidden object is small enough, unlike a wall or furniture.
 
-    `find_background` checks the others.
+    `find_background` checks the visible objects.
     """
     length, width, height = box.size.tolist()
     low = height <= settings.max_height_m - CUT_OFF_M

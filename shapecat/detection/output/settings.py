@@ -1,4 +1,4 @@
-"""Tuned constants of this stage, with their units and the reason for each."""
+"""Tuned constants of the output, with their units and the reason for each."""
 
 from typing import NamedTuple
 
@@ -14,11 +14,13 @@ class OutputSettings(NamedTuple):
     """Largest gap between the bottom of an object and the top of its support, metres: the part in
     between is hidden."""
     overlap_m: float = 0.04
-    """Largest overlap of the two, metres: a strip of the support may be labelled as the object."""
+    """Largest height, metres, by which an object may reach below the top of its support: a strip of
+    the support may be labelled as the object."""
     beside_m: float = 0.01
     """Largest distance, metres, from an object to the middle of another one that stands on it."""
     behind_m: float = 0.04
-    """The same behind its visible part, metres: its back is hidden."""
+    """Largest distance, metres, from the visible part of an object backwards to the middle of
+    another one that stands on it: its back is hidden."""
     lifted_m: float = 0.03
     """An object with a bottom higher than this above its plane, metres, does not stand on it."""
     sunk_m: float = 0.015
@@ -32,7 +34,8 @@ class OutputSettings(NamedTuple):
     forward_cos: float = 0.2
     """Approximate minimum cosine to the optical axis of a point in front of a camera."""
     min_cells_at_limit: int = 3
-    """Minimum number of cells at the range limit of an object that it cuts off: fewer are noise."""
+    """Minimum number of cells, at the range limit, of an object that the limit cuts off: fewer are
+    noise."""
     crowded: float = 0.08
     """Fraction of points behind others above which a cloud counts as fused from several views."""
 

@@ -1,4 +1,4 @@
-"""Supporting planes: up direction, parallel planes, planes with objects, heights."""
+"""Supporting planes: the up direction, the planes that objects stand on, and heights above them."""
 
 import numpy as np
 
@@ -20,9 +20,9 @@ def find_supporting_planes(
 ) -> tuple[list[SupportingPlane], F8]:
     """Find the horizontal planes that objects may stand on (thesis 4.3).
 
-    One plane is fitted at each peak in the height histogram of level surface, by least squares or
-    else RANSAC (Fischler and Bolles 1981). Then all planes get a common normal, and planes of which
-    only strips are visible are added.
+    One plane is fitted at each peak in a height histogram of the samples whose normal is nearly up,
+    by least squares or, if few inliers are close to it, by RANSAC (Fischler and Bolles 1981). Then
+    all planes get a common normal, and planes of which only strips are visible are added.
 
     Parameters
     ----------
@@ -33,8 +33,8 @@ def find_supporting_planes(
 
     Returns
     -------
-    The planes, lowest first, and the up direction (3,): the normal of the largest plane; zeros if
-    no level surface is found.
+    The planes, lowest first, and the up direction (3,): the normal of the largest plane. Without a
+    plane, up is the estimate of `estimate_up`, which may be zeros.
     """
     points = orient_points(grid)
     prior = np.zeros(3) if hint is None else hint

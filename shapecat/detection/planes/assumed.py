@@ -15,13 +15,13 @@ from shapecat.detection.planes.settings import ASSUMED, PLANES, UP
 __all__ = ["assume_plane", "find_unexplained"]
 
 SAMPLE_STRIDE = 4
-"""Step between the unexplained samples that place the plane."""
+"""Step between the unexplained samples that determine the height and extent of the plane."""
 
 
 def find_unexplained(grid: DepthGrid, explained: I4 | U1) -> Bool | None:
-    """Return the near samples where ``explained`` is 0, (rows, columns) bool; None if too few.
+    """Return a mask (rows, columns) of the near samples where ``explained`` is 0; None if too few.
 
-    ``explained`` (rows, columns) is not 0 on a plane, above one, or on a wall.
+    ``explained`` (rows, columns) is 0 except on a plane, above one, or on a wall.
     """
     in_range = grid.inverse_depth > np.float32(1 / ASSUMED.max_depth_m)
     unexplained: Bool = (explained == 0) & in_range
@@ -34,7 +34,7 @@ def assume_plane(
 ) -> SupportingPlane | None:
     """Return the level plane below most unexplained samples; None if it is above the camera.
 
-    It is the plane with the most surface within the height of an object above it; near surface has
+    Of all level planes, it has the most samples up to ``max_height_m`` above it; near samples have
     more weight. Its visible area is 0.
 
     Parameters

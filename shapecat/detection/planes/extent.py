@@ -25,11 +25,12 @@ __all__ = [
 ]
 
 DIRECTIONS = 16
-"""Sides of the convex outline of a plane."""
+"""Number of sides of the convex outline of a plane."""
 ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 COS, SIN = np.cos(ANGLES), np.sin(ANGLES)
 APART = 3
-"""Distance, in cells, from an inlier to the neighbours that may extend the plane."""
+"""Distance, in cells, from the first or last inlier of a row to neighbours that extend the outline
+if they lie on the plane."""
 
 
 class SupportingPlane(NamedTuple):
@@ -55,7 +56,14 @@ class SupportingPlane(NamedTuple):
 
 
 class PlaneCandidate(NamedTuple):
-    """A plane that may support objects, its inliers, and its covered area, m²."""
+    """A plane that may support objects.
+
+    Attributes
+    ----------
+    plane : the plane, with its outline and visible area.
+    inliers : its samples.
+    covered_m2 : area that counts as visible although objects cover it, m²; see `add_strip_planes`.
+    """
 
     plane: SupportingPlane
     inliers: DepthSamples
@@ -63,7 +71,7 @@ class PlaneCandidate(NamedTuple):
 
 
 def measure_candidate(grid: DepthGrid, samples: DepthSamples, plane: F8) -> PlaneCandidate:
-    """Measure a plane (a, b, c) on its inliers among samples."""
+    """Measure the outline and the area of a plane (a, b, c) on its inliers among samples."""
     inliers: DepthSamples = select_inliers(samples, plane, PLANES.tolerance)
     return PlaneCandidate(_measure(grid, inliers, plane), inliers)
 

@@ -27,18 +27,19 @@ __all__ = [
 MIN_HEIGHT_M = 0.004
 """Minimum height of an object's sample at a depth of 0, metres."""
 HEIGHT_NOISE = 0.0025
-"""Increase of that height, metres, at a depth of 1 m; it grows with the squared depth."""
+"""Increase of the minimum height at a depth of 1 m, metres. It grows with the squared depth."""
 FRINGE = 0.6
 """Next to an object, samples above this fraction of the minimum height belong to it. Elsewhere,
 half of such samples are noise of the plane."""
 CUT_OFF_M = 0.02
-"""What comes this near to the maximum height of an object continues above it, metres."""
+"""An object that comes this close to the maximum height is assumed to continue above it, metres."""
 BEYOND_M = 0.1
-"""Surface level with a plane, and this near to its outline, is not an object on a lower plane."""
+"""Surface at the height of a plane, and within this distance of its outline, metres, belongs to
+that plane. It is not an object on a lower plane."""
 OUT = -1e6
 """Placeholder for the height of cells that do not belong to a plane: below all noise."""
 FINE = 65536
-"""Steps per 1/m to which inverse depth is rounded."""
+"""Steps per 1/m to which the bounds of inverse depth in a row are rounded."""
 PLANE = np.dtype(
     [
         ("a", "f8"),  # a, b, c of inverse depth, as in `SupportingPlane`
@@ -60,8 +61,8 @@ class HeightMap(NamedTuple):
 
     Attributes
     ----------
-    plane_id : (rows, columns) int8. For plane k, from 0: k + 1 above it and inside its outline,
-        -(k + 1) on its surface. 0 elsewhere.
+    plane_id : (rows, columns) int8. With planes counted from 0, it is k + 1 above plane k and
+        inside its outline, -(k + 1) on the surface of plane k, and 0 elsewhere.
     height : (rows, columns) float32, metres above the plane of ``plane_id``.
     """
 
@@ -97,11 +98,11 @@ def measure_heights(grid: DepthGrid, planes: Records, max_height_m: float) -> He
 def _assign(
     grid: DepthGrid, plane: Row, number: int, max_height_m: float, heights: HeightMap
 ) -> None:
-    """Assign the free cells inside the outline of a plane to it; the loops over a row vectorise.
+    """Assign the cells inside the outline of a plane that have no plane yet; loops vectorise.
 
-    ``plane`` is a `PLANE`, and ``max_height_m`` the maximum height above it, metres. Compiled
-    without ``fast``: with it, the inlined copy would round heights differently in the process that
-    compiles and in later ones.
+    ``plane`` is a `PLANE`, numbered from 1; ``max_height_m`` is the maximum height above it,
+    metres. The kernel is compiled without ``fast``: with it, the inlined copy would round heights
+    differently in the process that compiles it and in later ones.
     """
     inv_depth, intrinsics, (plane_id, height) = grid.inverse_depth, grid.intrinsics, heights
     rows, columns = inv_depth.shape
@@ -112,7 +113,8 @@ def _assign(
     above, surface = np.int8(number), np.int8(-number)
     x = np.arange(columns).astype(np.float32)
     line, slack = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
-    # Level coordinates times inverse depth are linear in the image: per column, per row, constant.
+    # Level coordinates times inverse depth are linear in the image: ``sides`` holds their change
+    # per column, their change per row, and their constant term.
     sides = np.zeros((DIRECTIONS // 2, 3))
     for d in range(2):
         p, q = plane.axes[d, 0] / intrinsics.fx, plane.axes[d, 1] / intrinsics.fy
@@ -140,7 +142,7 @@ def _assign(
             step, first = np.float32(sides[k, 0]), np.float32(sides[k, 1] * i + sides[k, 2])
             extent = np.float32(plane.extent[k])
             opposite = np.float32(plane.extent[k + DIRECTIONS // 2])
-            # Few rows reach beyond a side; bounds rule out most of the others.
+            # Few rows reach beyond a side; these bounds let most of the others skip the exact test.
             ends = step * left + first, step * right + first
             limits = (
                 min(extent * min_inv_depth, extent * max_inv_depth),
@@ -164,7 +166,7 @@ def _assign(
 def _bounds(
     line: F4, inv_depth: F4, i: int
 ) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Return the first and last cell of a row with a height, and bounds of the inverse depth."""
+    """Return the first and last cell of row i with a height, and bounds of their inverse depth."""
     left, right = 0, line.size - 1
     while line[left] <= OUT:
         left += 1

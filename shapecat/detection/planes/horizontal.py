@@ -66,7 +66,7 @@ def _measure_candidates(
 
 
 def _common_up(candidates: list[PlaneCandidate]) -> F8:
-    """Return the mean normal (3,), weighted by the precision of each: area times width squared."""
+    """Return the mean of the normals, (3,), each weighted by its precision: area * width²."""
     half = DIRECTIONS // 2
     mean = np.zeros(3)
     for plane, *_ in candidates:
@@ -93,7 +93,7 @@ def _refit_parallel(intrinsics: PinholeIntrinsics, inliers: DepthSamples, up: F8
 def fit_peaks(
     samples: DepthSamples, heights: F4, intrinsics: PinholeIntrinsics, up: F8, trials: F8
 ) -> list[F8]:
-    """Fit a plane to each peak of the heights; return coefficients a, b, c (3,) of those found.
+    """Fit a plane to each peak of the heights; return (a, b, c) of each plane of sufficient area.
 
     Parameters
     ----------
@@ -138,7 +138,10 @@ def _histogram_peak(heights: F4) -> np.float64:
 def _fit(
     samples: DepthSamples, intrinsics: PinholeIntrinsics, up: F8, trials: F8, offset: float
 ) -> tuple[F8, bool]:
-    """Fit a plane (3,) to samples at about one height; return it, and whether it is large."""
+    """Fit a plane (3,) to samples at about one height; return it, and whether it is large enough.
+
+    ``offset`` is that height above the sensor, metres.
+    """
     level = horizontal_plane(intrinsics, up, offset)
     plane = level.copy()
     count = 0

@@ -1,4 +1,4 @@
-"""Oriented points: position, smoothness and normal of the surface at every third sample."""
+"""Oriented points: position and normal of the surface at every third row and column."""
 
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ FIRST = STRIDE // 2
 
 
 class OrientedPoints(NamedTuple):
-    """Every third sample of a depth grid with its normal; n = rows * columns, row by row.
+    """Every third row and column of a depth grid, with normals; n = rows * columns, row by row.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class OrientedPoints(NamedTuple):
     normals : (3, n) float32 unit vectors towards the camera, sensor frame; 0 where the surface is
         not smooth.
     positions : (3, n) float32, metres, sensor frame; 0 where depth is missing.
-    smooth : the number of points on smooth surface.
+    smooth : the number of points with a normal.
     """
 
     inverse_depth: F4
@@ -38,7 +38,7 @@ class OrientedPoints(NamedTuple):
 
 
 def orient_points(grid: DepthGrid) -> OrientedPoints:
-    """Return every third sample, with its normal if its neighbours lie on a plane with it."""
+    """Return every third row and column, with normals where neighbours lie on a plane."""
     coarse = np.ascontiguousarray(grid.inverse_depth[FIRST::STRIDE, FIRST::STRIDE])
     normals, positions = np.zeros((2, 3, coarse.size), np.float32)
     smooth = _orient(coarse, grid.intrinsics, grid.discontinuity, normals, positions)

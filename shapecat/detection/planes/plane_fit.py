@@ -32,8 +32,8 @@ class DepthSamples(NamedTuple):
 def select_inliers(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSamples:
     """Return the samples whose inverse depth differs by less than ``tolerance``, 1/m, from a plane.
 
-    Its inverse depth at column j and row i is ``a * j + b * i + c``, 1/m; where this is not above
-    0, the plane is not visible.
+    The inverse depth of the plane (a, b, c) at column j and row i is ``a * j + b * i + c``, 1/m;
+    where this is not positive, the plane is not visible and has no inliers.
     """
     inliers = np.zeros((3, samples.inverse_depth.size), np.float32)
     n = 0

@@ -18,13 +18,13 @@ __all__ = [
 ]
 
 TRIALS = 240
-"""Number of planes tried: one with a seventh of the samples is missed with a probability of a
+"""Number of planes tried. A plane with a seventh of the samples is missed with a probability of one
 half."""
 SAMPLES_PER_BLOCK = 256
 """Number of samples after which a plane that can no longer win is dropped."""
 MIN_DOUBLE_AREA = 30.0
-"""Twice the minimum area of the triangle of three samples, in square cells: noise spoils smaller
-ones."""
+"""Twice the minimum area of the triangle of three samples, in square cells. Noise spoils the planes
+of smaller triangles."""
 SAMPLE = 4800
 """Approximate number of samples for RANSAC: more only take longer."""
 
@@ -47,7 +47,7 @@ def sample_grid(inv_depth: F4, mask: F4) -> DepthSamples:
 def select_outliers(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSamples:
     """Return the samples whose inverse depth differs by more than ``tolerance``, 1/m, from a plane.
 
-    Its inverse depth at column j and row i is ``a * j + b * i + c``, 1/m.
+    The inverse depth of the plane (a, b, c) at column j and row i is ``a * j + b * i + c``, 1/m.
     """
     a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     gate = np.float32(tolerance)
@@ -61,7 +61,7 @@ def select_outliers(samples: DepthSamples, plane: F8, tolerance: float) -> Depth
 
 
 def draw_trials(rng: np.random.Generator) -> F8:
-    """Draw random numbers (n, 3) in [0, 1), which choose the samples in all kernels of a frame."""
+    """Draw random numbers (n, 3) in [0, 1), which pick the samples in all searches of a frame."""
     return rng.random((TRIALS, 3))
 
 
@@ -74,7 +74,9 @@ def ransac_plane(
     cosines: tuple[float, float],
     tolerance: float,
 ) -> tuple[F8, int]:
-    """Return the plane (a, b, c) of inverse depth with the most inliers, and how many; 0 if none.
+    """Return the plane (a, b, c) of inverse depth with the most inliers, and their number.
+
+    If no plane has at least three inliers, the number is 0.
 
     Parameters
     ----------

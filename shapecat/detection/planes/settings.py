@@ -7,79 +7,92 @@ __all__ = ["ASSUMED", "PLANES", "STRIPS", "UP"]
 
 
 class UpSettings(NamedTuple):
-    """Constants for estimating the up direction."""
+    """Constants for estimating the up direction.
+
+    A level is a peak in the histogram of heights along a direction that may be up.
+    """
 
     facing_cos: float = math.cos(math.radians(20))
-    """Minimum cosine between a direction and the normal of surface that faces it, for 20 degrees:
-    noise turns normals by up to 15."""
+    """Minimum cosine between a direction and the normals of surfaces that face it (20 degrees):
+    noise turns normals by up to 15 degrees."""
     hint_cos: float = math.cos(math.radians(15))
-    """Minimum cosine between a normal and the hint, for 15 degrees: IMUs and poses are off by
-    less."""
+    """Minimum cosine between a normal and the given up direction (15 degrees): the errors of IMUs
+    and poses are smaller."""
     corner_cos: float = 0.3
     """Directions with a smaller absolute cosine between them may be the normals of two walls."""
     min_share: float = 0.04
-    """Minimum fraction of the surface that faces up: a table at the edge of the image."""
+    """Minimum fraction of the points that must face a direction, and of the weight that must be in
+    a large level. A table at the edge of the image has about this."""
     trials: int = 120
-    """Directions tried: one shared by 1 in 25 normals is missed with a probability below 1 %."""
+    """Number of directions tried. A direction shared by 1 in 25 normals is missed with a
+    probability below 1 %."""
     level_bin_m: float = 0.04
-    """Height of a bin, metres: more than the noise at 2 m, less than the gap between boards."""
+    """Size of a bin of that histogram, metres: more than the noise at a depth of 2 m, less than the
+    gap between boards."""
     level_exponent: float = 0.7
-    """Exponent of the surface in large levels, in the score of an up direction: a camera sees more
-    of the wall behind a counter than of the counter."""
+    """Exponent of the weight of large levels in the score of a direction. It is below 1, because a
+    camera sees more of the wall behind a counter than of the counter."""
     purity_exponent: float = 2.0
-    """Exponent of the fraction of the surface facing the direction that lies in large levels."""
+    """Exponent of the purity in the score of a direction: of the surface that faces the direction,
+    the fraction in large levels."""
     frontal_penalty: float = 0.6
-    """Fraction of the score that a direction along the optical axis loses: it belongs to a wall."""
+    """Fraction of the score that a direction along the optical axis loses: it is likely the normal
+    of a wall."""
     roll_penalty: float = 4.0
     """The score of a direction that implies a camera on its side or upside down is divided by 1
     plus this."""
     frontal_sin2: float = 0.03
     """Squared sine of the angle to the optical axis below which a direction implies no roll."""
     half_weight_m: float = 1.5
-    """Depth at which surface has half the weight, so that near surface dominates."""
+    """Depth at which a point has half the weight, metres, so that near surfaces dominate."""
 
 
 class PlaneSettings(NamedTuple):
     """Constants for finding planes and distinguishing them from the tops of objects."""
 
     tolerance: float = 0.01
-    """Distance of an inlier from a plane in inverse depth, 1/m: three steps of a Kinect."""
+    """Distance of an inlier from a plane in inverse depth, 1/m: three disparity steps of a
+    Kinect."""
     level_cos: float = math.cos(math.radians(25))
-    """Normals within this angle of up belong to level surface: noise tilts them by less."""
+    """Minimum cosine between up and the normals of level surfaces (25 degrees): noise tilts them
+    by less."""
     bin_m: float = 0.01
-    """Height of a bin of level surface, metres: the noise at 1.5 m."""
+    """Size of a bin in the histogram of heights, metres: the noise at a depth of 1.5 m."""
     min_area_m2: float = 0.02
-    """Visible area of the smallest plane: the uncovered strip of a table."""
+    """Minimum visible area of a plane: about the uncovered strip of a table."""
     margin_m: float = 0.01
-    """A plane extends this far beyond its samples, metres: their spacing."""
+    """A plane extends this far beyond its samples, metres: about the spacing of the samples."""
     steady_cos: float = math.cos(math.radians(6))
-    """The samples at the height of a plane do not determine it if it is tilted more from up."""
+    """Minimum cosine between up and the normal of a fitted plane (6 degrees). If the plane tilts
+    more, its samples do not determine the tilt."""
     close_share: float = 0.75
     """Minimum fraction of the inliers within half the tolerance. A plane tilted between two others,
     such as a table and the plates on it, has fewer."""
     furniture_m2: float = 0.25
-    """Larger planes are furniture, whatever is below their edge."""
+    """Larger planes are furniture, unless they have a wall below their edge and nothing on them."""
     likely_m2: float = 0.1
-    """Larger planes are furniture if the space below their edge is not visible."""
+    """Larger planes are likely furniture if the space below their edge is not visible."""
     board_m2: float = 0.03
     """Smaller planes above another plane are not boards."""
     min_drop_m: float = 0.06
-    """A plane lower than this above another is the top of an object."""
+    """A plane less than this above another is the top of an object, metres."""
     step_m: float = 0.01
     """Length of the steps in which the surroundings of an edge are searched, metres."""
     wall_m: float = 0.03
     """Samples within this distance behind an edge belong to the wall of a box, metres."""
     wall_share: float = 0.5
-    """A wall closes a box if more than this fraction of the samples below an edge are on it."""
+    """A plane is the top of a box if more than this fraction of the samples below its edge are on a
+    wall."""
     bare_share: float = 0.02
-    """Maximum fraction of the samples over a bare plane that are higher above it than twice the
-    minimum height of an object."""
+    """Of the samples inside the outline of a plane with nothing on it, the maximum fraction that is
+    higher above it than twice the minimum height of an object."""
     around_m: float = 0.03
-    """Distance from a sample to the surroundings of its plane, metres."""
+    """Distance from a sample of a plane to where its surroundings are examined, metres."""
     drop_ratio: float = 0.2
-    """Upper bound of the ratio of drops to rises around the floor of a bin."""
+    """Around the floor of a bin, the surface drops at fewer places than this fraction of those
+    where it rises."""
     hidden_m: float = 0.2
-    """Maximum width that objects hide of such a floor at one side, metres."""
+    """Maximum width of the part of a bin's floor that objects hide at one side, metres."""
     max_object_m: float = 0.4
     """Maximum height of an object above the large plane it stands on, metres."""
 
@@ -95,24 +108,26 @@ class StripSettings(NamedTuple):
     min_slope: float = 0.03
     """Smallest downward slope of a ray (down / forward); flatter rays run along a surface."""
     min_rise: float = 0.05
-    """Smallest downward slope that is used to compute the area a cell covers."""
+    """Lower bound of the downward slope from which the area of a cell is computed."""
     below: int = 10
     """Number of bins below a plane that hold almost no surface."""
     above: int = 30
     """Number of bins above a covered plane that hold the tops of the objects on it."""
     covers: float = 1.0
-    """Minimum area of the tops of objects that cover a plane, relative to its visible area."""
+    """Minimum area of the tops of objects that cover a plane, relative to the visible area of the
+    plane."""
     contrast: float = 2.0
-    """Minimum area of a plane, relative to that of the bins below."""
+    """Minimum area of a plane, relative to the area in the bins below it."""
     end: float = 1.25
-    """Minimum inverse depth of strips, relative to that of the farthest sample: four fifths of the
-    range."""
+    """Minimum inverse depth of strips, relative to that of the farthest sample: strips lie within
+    four fifths of the range."""
     dip: float = 0.6
-    """Just above a plane, the area of level surface falls below this fraction of the plane's."""
+    """Just above a plane, the area of level surface falls below this fraction of the area of the
+    plane."""
     min_area_m2: float = 0.001
     """Minimum visible area of a covered plane."""
     min_points: int = 15
-    """Minimum number of points, of every third sample, at a height that may have strips."""
+    """Minimum number of oriented points at a height that may have strips."""
     same_m: float = 0.012
     """Planes whose heights differ by less are the same plane, metres."""
     tallest_m: float = 0.15
@@ -128,8 +143,8 @@ class AssumedSettings(NamedTuple):
     """Depth up to which such samples may be objects that hide their support, metres; farther away
     they are background."""
     unexplained: float = 0.2
-    """Fraction of unexplained samples above which a plane is assumed; plain tables have at most
-    0.06."""
+    """Fraction of unexplained samples above which a plane is assumed. If a table is in plain view,
+    the fraction is at most 0.06."""
     noise_share: float = 0.01
     """Fraction of the unexplained samples that may lie below the plane, as noise."""
 

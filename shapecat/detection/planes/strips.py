@@ -42,9 +42,9 @@ height of a strip."""
 def may_have_strips(
     grid: DepthGrid, points: OrientedPoints, candidates: list[PlaneCandidate]
 ) -> bool:
-    """Return whether there is a height with many points, but few below it, as where strips are.
+    """Return whether some height has many points but few just below it, as a strip has.
 
-    ``candidates`` are parallel planes, at least one.
+    This test is quicker than `add_strip_planes`. ``candidates`` are parallel planes, at least one.
     """
     count = _count_by_height(points, candidates[0].plane.up)
     return any(_may_be_strips(grid, candidates, *peak) for peak in _peaks(count, STRIPS.min_points))
@@ -55,7 +55,8 @@ def _may_be_strips(
 ) -> bool:
     """Return whether a plane at a height is seen at a grazing angle, or covered by objects.
 
-    ``above`` is the level area just above the plane, relative to its own area, from `_peaks`.
+    ``above`` is the level area just above the plane, relative to the area of the plane, as
+    `_peaks` yields it.
     """
     large = [plane.offset for plane, *_ in candidates if plane.area_m2 > PLANES.likely_m2]
     up = candidates[0].plane.up
@@ -69,10 +70,10 @@ def _may_be_strips(
 def add_strip_planes(grid: DepthGrid, candidates: list[PlaneCandidate]) -> list[PlaneCandidate]:
     """Add the planes of which only narrow strips are visible.
 
-    Hardly any surface lies below such a plane. A board shows some surface at its own height; a
+    Hardly any surface lies just below such a plane. A board shows some surface at its own height; a
     covered table shows more just above, on the objects that cover it. ``candidates`` are parallel
-    planes, lowest first, at least one. The result has the same order; some of the given planes may
-    have a larger extent in it.
+    planes, lowest first, at least one. The result is in the same order. In it, a given plane at the
+    height of the strips may have a larger extent, or be replaced.
     """
     up = max(candidates, key=lambda candidate: candidate.plane.area_m2).plane.up
     strips, area = _level_strips(grid.inverse_depth, grid.intrinsics, up)
@@ -123,7 +124,7 @@ def _plane_at(grid: DepthGrid, strips: F4, up: F8, height: float) -> PlaneCandid
 def _covered(
     candidate: PlaneCandidate, strips: F4, intrinsics: PinholeIntrinsics
 ) -> PlaneCandidate:
-    """Set the covered area of a plane: 0 if most of its outline is visible."""
+    """Return the candidate with its covered area, which is 0 if most of the outline is visible."""
     plane = candidate.plane
     corners = outline_corners(plane.up, plane.offset, plane.extent)
     area_vector = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
@@ -135,7 +136,7 @@ def _covered(
 
 
 def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane) -> float:
-    """Return the area of level surface just above the outline of a plane, m²."""
+    """Return the area of level surface inside the outline of a plane and just above it, m²."""
     subset = strips[:, ::AREA_STRIDE]
     above = subset[3] - plane.offset
     tops = subset[:, (above > STRIPS.same_m) & (above < STRIPS.tallest_m)]
@@ -149,11 +150,11 @@ def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane
 
 
 def _peaks(amount: F8, threshold: float) -> Iterator[tuple[float, float]]:
-    """Find the peaks of level surface that have almost no surface below them.
+    """Find the heights with a peak of level surface and almost no surface just below.
 
     Parameters
     ----------
-    amount : (BINS,) level surface by height, the lowest first.
+    amount : (BINS,) level surface at each height, as points or area, the lowest first.
     threshold : minimum amount of a peak together with the two bins beside it.
 
     Yields
@@ -175,7 +176,7 @@ def _peaks(amount: F8, threshold: float) -> Iterator[tuple[float, float]]:
 
 @kernel
 def _count_by_height(points: OrientedPoints, up: F8) -> F8:
-    """Count the points by height, (BINS,) lowest first, without those that face sideways."""
+    """Count the points at each height, (BINS,) lowest first, except those that face sideways."""
     x, y, z = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
     xs, ys, zs = points.positions[0], points.positions[1], points.positions[2]
     nx, ny, nz = points.normals[0], points.normals[1], points.normals[2]
@@ -191,11 +192,11 @@ def _count_by_height(points: OrientedPoints, up: F8) -> F8:
 
 @kernel
 def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple[F4, F8]:
-    """Find the samples on level surface.
+    """Find the samples on level surfaces.
 
     At least three of the four neighbours of such a sample are closer to a level surface through it
-    than to a vertical one. Returns columns, rows, inverse depths and heights (4, n) of the samples;
-    and the area of their surface by height, (BINS,) m², the lowest first.
+    than to a vertical one. Returns the columns, rows, inverse depths and heights (4, n) of the
+    samples, and the area of their surface at each height, (BINS,) m², the lowest first.
     """
     rows, columns = inv_depth.shape
     across, down = np.float32(up[0] / intrinsics.fx), np.float32(up[1] / intrinsics.fy)

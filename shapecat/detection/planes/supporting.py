@@ -26,15 +26,16 @@ __all__ = ["supporting_planes"]
 STEPS_TO_EDGE = 5
 """Maximum number of steps from a sample, towards the camera, to the edge of its plane."""
 STEPS_DOWN = 20
-"""Maximum number of steps down from that edge."""
+"""Maximum number of steps down from the edge of a plane."""
 EDGE_CELLS = 2
 """Number of cells in which an edge is blurred."""
 MIN_BELOW = 20
-"""Minimum number of samples below an edge that allow a decision."""
+"""Minimum number of samples below an edge from which to decide what is there."""
 COUNT_STRIDE = 2
 """Step between the rows and columns of the samples that show whether something is on a plane."""
 MIN_ABOVE = 20 // COUNT_STRIDE**2
-"""Minimum number of these on something on a plane; a small object has more."""
+"""Minimum number of counted samples above a plane that show something on it; a small object has
+more."""
 
 
 def supporting_planes(
@@ -59,8 +60,8 @@ def supporting_planes(
        below the camera with nothing on it, such as the top of a carton.
     9. Keep all others.
 
-    Above another plane, the largest connected part of a plane counts: the tops of equal boxes are
-    many small parts.
+    The area of a plane above another is that of its largest connected part, since the tops of equal
+    boxes form a plane of many small parts.
 
     Parameters
     ----------
@@ -97,7 +98,7 @@ def _is_top(
     if on_wall + beyond >= MIN_BELOW:
         walled = on_wall > PLANES.wall_share * (on_wall + beyond)
         return walled and not (furniture and _count_above(grid, plane)[0] >= MIN_ABOVE)
-    below_camera = plane.extent.min() > 0  # which cannot see the sides below its edge
+    below_camera = plane.extent.min() > 0  # the camera cannot see the sides of the object
     if furniture or area_m2 < PLANES.likely_m2 or not below_camera:
         return area_m2 < PLANES.likely_m2
     above, inside = _count_above(grid, plane)
@@ -230,7 +231,7 @@ def _count_below_edge(
 
 @kernel(inline=True)
 def _blurred_steps(fx: float, plane: SupportingPlane, x: float, y: float, z: float) -> int:
-    """Return the number of steps below an edge that cannot be told from the surface beyond it.
+    """Return the number of steps below an edge that look the same as the surface beyond it.
 
     ``x``, ``y``, ``z`` are a point of the edge, metres, sensor frame; ``fx`` is in cells. Seen
     from above, the side below an edge covers few cells, and the edge is blurred.

@@ -19,8 +19,8 @@ MAX_DIRECTIONS = 4
 NORMALS_PER_BLOCK = 512
 """Number of normals after which a direction that can no longer win is dropped."""
 GRAZING_COS = 0.1
-"""Lower bound of the cosine between a normal and a ray where an area is measured: at more grazing
-angles, noise decides."""
+"""Lower bound of the cosine between a normal and a ray, from which the area of a point is computed.
+At more grazing angles, noise would determine the area."""
 
 
 @kernel
@@ -30,9 +30,10 @@ def estimate_up(
     """Return the unit normal (3,) of the dominant supporting plane; zeros if there is none.
 
     Without a hint, the candidates are the normals of the largest planes and the directions
-    perpendicular to two walls. The candidate with the most surface in large levels wins; a level
-    much smaller than a table scores less. So do candidates along the line of sight, so that the
-    boards of a shelf beat its back, and distant surface has less weight.
+    perpendicular to two walls. The candidate with the most surface in large levels wins; a level is
+    a peak in the histogram of heights along the candidate. Distant surface has less weight. The
+    score is lower if the levels are much smaller than a table, or if the candidate points along the
+    line of sight, so that the boards of a shelf beat its back.
 
     Parameters
     ----------
@@ -83,7 +84,7 @@ def _every_second(points: OrientedPoints, intrinsics: PinholeIntrinsics) -> F4:
 
 @kernel(inline=True)
 def _bins_of(surface: F4) -> int:
-    """Return the number of bins of `UpSettings.level_bin_m` that hold all points, (8, n)."""
+    """Return how many bins of `UpSettings.level_bin_m` cover the heights of all points (8, n)."""
     farthest2 = 0.0
     for k in range(surface.shape[1]):
         x, y, z = surface[3, k], surface[4, k], surface[5, k]
@@ -93,7 +94,7 @@ def _bins_of(surface: F4) -> int:
 
 @kernel(inline=True)
 def _directions(normals: F4, min_count: float, trials: F8) -> F8:
-    """Return directions (n, 3) with many normals, most first, found one by one by RANSAC."""
+    """Return directions (n, 3) that many normals share, the most common first, by RANSAC."""
     directions = np.zeros((MAX_DIRECTIONS, 3))
     for k in range(MAX_DIRECTIONS):
         if (
@@ -209,10 +210,10 @@ def _score(surface: F4, direction: F8, bins: int, roll_penalty: float) -> float:
 
 @kernel(inline=True)
 def _large_levels(count: F8, areas: F8, min_weight: float) -> tuple[float, float, float]:
-    """Sum the weights of levels above ``min_weight``, the squares of these, and the areas.
+    """Sum, over the levels heavier than ``min_weight``, weights, squared weights, and areas (m2).
 
-    ``count`` and ``areas`` (bins,) are the weights and the areas, m2, by height.
-    A level fills two bins, and has more weight than its neighbours: slanted surface has no peaks.
+    ``count`` and ``areas`` (bins,) are the weights and the areas, m2, at each height. A level fills
+    two bins and has more weight than its neighbours; slanted surfaces have no such peaks.
     """
     weight = squares = area = 0.0
     last = count.size - 1
@@ -259,7 +260,10 @@ def _count_levels(surface: F4, direction: F8, bins: int) -> tuple[F8, F8, float,
 def _refined(
     points: OrientedPoints, surface: F4, intrinsics: PinholeIntrinsics, direction: F8, bins: int
 ) -> F8:
-    """Return the refined normal (3,) of the largest plane that faces ``direction``."""
+    """Return the normal (3,) of the largest plane that faces ``direction``, by least squares.
+
+    If the fit turns it away by more than 20 degrees, return ``direction``.
+    """
     count, _, _, _ = _count_levels(surface, direction, bins)
     plane = horizontal_plane(intrinsics, direction, -(np.argmax(count) + 0.5) * UP.level_bin_m)
     samples, _ = level_samples(points, direction)

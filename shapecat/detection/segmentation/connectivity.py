@@ -1,4 +1,4 @@
-"""Connectivity: the links between object cells on one surface, and its concavity at each cell.
+"""Connectivity: the links between object cells on one surface, and the concavity at each cell.
 
 Source: Stein et al. 2014 (local convexity as a criterion to separate objects).
 """
@@ -19,7 +19,7 @@ from shapecat.jit import kernel, unset
 __all__ = ["SurfaceGraph", "connect_surfaces"]
 
 BENT = 4
-"""Factor of the bits of a link: a temporary mark that only a local plane supports the link."""
+"""The bit of a link times this is a temporary mark: only a local plane supports the link."""
 MIN_CHORD = 3e-4
 """Squared distance between two unit normals at an angle of one degree."""
 
@@ -33,8 +33,8 @@ class SurfaceGraph(NamedTuple):
     Attributes
     ----------
     local_plane : (rows, 3, columns) float32, inverse depth of the fitted plane at the cell, and its
-        change per column and per row; 0 in object cells without a fit. In other
-        cells near these, the inverse depth is 0; the rest is uninitialised.
+        change per column and per row; 0 in object cells without a fit. In the other cells, the
+        inverse depth is 0 near object cells; the rest is uninitialised.
     normal : (rows, 3, columns) float32 unit normal towards the camera, sensor frame; 0 in object
         cells without a fit, uninitialised elsewhere.
     links : (rows, columns) uint8, `RIGHT` and `DOWN` where the surface continues to that neighbour.
@@ -84,7 +84,7 @@ def _blank(spans: I4, columns: int) -> F4:
 
 @kernel
 def _link(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, links: U1) -> None:
-    """Link neighbours at similar depths, or where one lies on the local plane of the other."""
+    """Link neighbours if their depths are similar, or if one lies on the other's local plane."""
     inv_depth, jump = grid.inverse_depth, np.float32(grid.discontinuity)
     rows, columns = inv_depth.shape
     depths, plane_ids = inv_depth.reshape(-1), plane_id.reshape(-1)
@@ -211,21 +211,25 @@ def _raise_concavity(
     chords: F4,
     worst: F4,
 ) -> None:
-    """Raise ``worst`` to the squared chord of the normals on opposite sides, where concave.
+    """In concave cells, raise ``worst`` to the squared distance of the unit normals on both sides.
+
+    This distance is the chord of the angle between the two normals.
 
     Parameters
     ----------
     flat : inverse depth, local planes and normals of all cells, flattened.
-    gate : largest distance of both planes from the cell, 1/m.
+    gate : largest distance of either local plane from the sample of the cell, 1/m.
     cells : the row, the first column, one past the last, and the number of columns.
-    shift : offset, in rows and columns, from a cell to the normals that are compared, both ways.
+    shift : offset, in rows and columns, from a cell to one of the two normals that are compared;
+        the other is at the opposite offset.
     gaps, chords : (columns,) work space.
     worst : (columns,) squared chords of the row.
 
     Notes
     -----
-    There are three loops, because the compiler vectorises only loops over few arrays; no slices,
-    because each counts references; and unsigned indices, which need no check for negative values.
+    There are three loops, because the compiler vectorises only loops over few arrays. There are no
+    slices, because each counts references. Indices are unsigned, because signed ones are checked
+    for negative values.
     """
     i, first, last, columns = cells
     di, dj = shift
@@ -254,7 +258,7 @@ def _raise_concavity(
         nx, ny = normal[a0 + k] - normal[b0 + k], normal[a1 + k] - normal[b1 + k]
         nz = normal[a2 + k] - normal[b2 + k]
         v1, v2 = plane[a0 + k], plane[b0 + k]
-        # The ray from one place to the other, times both inverse depths: no division.
+        # The vector from one point to the other, times both inverse depths to avoid divisions.
         step = np.float32(np.int32(k)) * per_x
         along = ((x1 + step) * v2 - (x2 + step) * v1) * nx + (v2 - v1) * nz
         along += (y1 * v2 - y2 * v1) * ny

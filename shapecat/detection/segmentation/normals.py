@@ -1,8 +1,8 @@
 """Normals: least-squares planes around the object cells, many cells at a time.
 
 Numba vectorises over 16 cells only if it knows that arrays do not overlap, which requires few
-arrays at constant distances. The windows of a run of cells are therefore first copied to a buffer
-of fixed width, and the sums of each cell stay in registers.
+arrays at constant distances. The windows of a run (consecutive cells of a row above one plane) are
+therefore first copied to a buffer of fixed width, and the sums of each cell stay in registers.
 """
 
 from typing import Any
@@ -34,8 +34,8 @@ PITCH = RUN + 2 * WINDOW
 def fit_local_planes(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, normal: F4) -> None:
     """Fit a plane to the neighbourhood of each object sample; write its coefficients and normal.
 
-    The neighbourhood is up to 25 samples in a checkerboard pattern: those above the same supporting
-    plane have weight 1, the others 0.
+    The neighbourhood is up to 25 samples in a checkerboard pattern. Samples above the same
+    supporting plane and at similar depth have weight 1, the others 0.
 
     Parameters
     ----------
@@ -101,9 +101,10 @@ def _next_run(plane_ids: I4, row: int, j: int, last: int) -> tuple[int, int]:
 def _copy_windows(
     depths: F4, plane_ids: I4, shape: tuple[int, int], run: tuple[int, int, int], values: F4
 ) -> None:
-    """Copy the rows around a run and `WINDOW` cells beyond its ends; `NONE` above other planes.
+    """Copy the rows around a run, and `WINDOW` cells beyond its ends, to ``values``.
 
-    ``run`` is its row, its first column, and one after its last.
+    Writes `NONE` for cells above other planes. ``run`` is the row of the run, its first column, and
+    one past its last.
     """
     rows, columns = shape
     i, start, end = run
@@ -177,7 +178,7 @@ def _fit_run(
 
 @kernel(fast=True, inner=True)
 def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> Any:
-    """Return the sum of one value per row, each times the offset from the middle row."""
+    """Return the sum of the values of rows -3, -2, -1, 1, 2 and 3, each times its row number."""
     return np.float32(3) * (g - a) + np.float32(2) * (f - b) + (e - c)
 
 
@@ -185,7 +186,7 @@ def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> An
 def _four(
     values: F4, p: int, center: float, outer_gate: float, inner_gate: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the sums over a row of a window sampled at -3, -1, 1 and 3 columns from ``p``."""
+    """Return the sums of 1, x, x x, v, x v over the samples at columns -3, -1, 1, 3 from ``p``."""
     a, va = _sample(values, p - 3, center, outer_gate)
     b, vb = _sample(values, p - 1, center, inner_gate)
     c, vc = _sample(values, p + 1, center, inner_gate)
@@ -199,7 +200,7 @@ def _four(
 def _three(
     values: F4, p: int, center: float, outer_gate: float, inner_gate: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the sums over a row of a window sampled at -2, 0 and 2 columns from ``p``."""
+    """Return the sums of 1, x, x x, v, x v over the samples at columns -2, 0, 2 from ``p``."""
     a, va = _sample(values, p - 2, center, outer_gate)
     b, vb = _sample(values, p, center, inner_gate)
     c, vc = _sample(values, p + 2, center, outer_gate)

@@ -1,4 +1,4 @@
-"""Tuned constants of this stage, with their units and the reason for each."""
+"""Tuned constants of segmentation, with their units and the reason for each."""
 
 from typing import NamedTuple
 
@@ -10,35 +10,37 @@ class SegmentationSettings(NamedTuple):
 
     gate: float = 0.008
     """Largest difference in inverse depth between a sample of a local plane and its centre, 1/m:
-    two steps of a Kinect."""
+    two disparity steps of a Kinect."""
     gate_slope: float = 0.008
-    """Increase of that limit per cell from the centre, 1/m: surfaces slant."""
+    """Increase of ``gate`` per cell from the centre, 1/m, since surfaces slant."""
     min_samples: int = 5
     """Minimum number of samples of a local plane: three define one, noise requires more."""
     min_spread: float = 0.2
-    """Minimum determinant of the covariance of their positions, cells to the fourth power: samples
-    in a line define no plane."""
+    """Minimum determinant of the covariance of the samples' positions, cells to the fourth power:
+    samples in a line define no plane."""
     bridged: int = 8
-    """Widest gap within a run, in cells: a new run takes longer."""
+    """Widest gap within a run, in cells: starting a new run takes longer than bridging the gap."""
     base: int = 3
-    """Cells between an edge and the surfaces that are compared: half a window of a local plane."""
+    """Distance, in cells, from an edge to the surfaces that are compared on both sides of it: half
+    a window of a local plane."""
     base_diagonal: int = 2
-    """The same distance on a diagonal, in cells along each axis."""
+    """The distance ``base`` on a diagonal, in cells along each axis."""
     slope_cells: int = 2
-    """Cells on either side of a step over which the slope there is measured."""
+    """Number of cells on each side of a step over which the slope there is measured."""
     step_share: float = 0.5
-    """Minimum difference of a step from the slope on either side, relative to a discontinuity. On
-    one side it is at least a whole discontinuity."""
+    """Minimum difference between the change across a step and the slope on each side of it, as a
+    fraction of a discontinuity. On one of the sides, it is at least a whole discontinuity."""
     edge_deg: int = 18
-    """Minimum concave angle that may separate two objects; a bowl of 7 cm turns by 16 degrees over
-    the same cells."""
+    """Minimum concave angle that may separate two objects; the inside of a 7 cm bowl turns by 16
+    degrees over the same number of cells."""
     min_cells: int = 12
     """Minimum number of cells of a segment; smaller parts join the segments around them."""
     max_segments: int = 250
-    """Maximum number of segments, the largest ones: the time grows with its square."""
+    """Maximum number of segments. Only the largest are kept, since the time grows with the square
+    of their number."""
     bucket_deg: int = 4
-    """Cells whose angles are in the same range of this width are flooded together: the angles are
-    not more precise."""
+    """Width of a range of angles, degrees. Cells in one range are flooded together, since the
+    angles are not more precise."""
     side_step_m: float = 0.01
     """Minimum step of one side of the outline, metres; less is noise at 1.5 m."""
     both_steps_m: float = 0.02

@@ -17,7 +17,8 @@ NO_EDGE = 255
 """Concave angle that no edge reaches, degrees."""
 BUCKETS = 256 // SEGMENTATION.bucket_deg
 SeedSplitter = Callable[[SurfaceGraph, I4, int], int]
-"""Splits the labels 1..n of seeds (rows, columns) in place; returns the new n."""
+"""A function that gets (graph, labels, n), splits the seeds 1..n of ``labels`` (rows, columns) in
+place, and returns the new n."""
 LEFT, UP = 4, 8
 """Bits of links to the other two neighbours, in addition to `RIGHT` and `DOWN`."""
 
@@ -41,7 +42,10 @@ def watershed(
 
 @kernel
 def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n: int) -> int:
-    """Label connected cells with angles below ``edge_deg`` from ``n`` + 1; return the last."""
+    """Label connected parts of unlabelled cells with angles below ``edge_deg``, from ``n`` + 1.
+
+    Small parts stay unlabelled. Returns the last label.
+    """
     inside: Bool = np.zeros(labels.shape, np.bool_)
     concavity, spans, threshold = graph.concavity, graph.spans, np.uint8(edge_deg)
     for i in range(len(spans)):
@@ -64,9 +68,10 @@ def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n
 
 @kernel(inline=True)
 def _min_size(sizes: I4, n: int) -> tuple[int, int]:
-    """Return the size of the smallest components to label, and how many of this size.
+    """Choose the largest components of ``sizes`` (k,), as many as ``n`` segments leave room for.
 
-    The largest ones of ``sizes`` (k,) are labelled, as many as ``n`` segments leave room for.
+    Returns a size and a number: all larger components are chosen, and this number of those of
+    exactly that size.
     """
     min_size, room = SEGMENTATION.min_cells - 1, SEGMENTATION.max_segments - n
     while True:

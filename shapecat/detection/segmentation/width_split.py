@@ -22,7 +22,7 @@ BANDS_BESIDE = SEGMENTATION.bands_beside
 
 
 class Outlines(NamedTuple):
-    """The lateral range of segments 1..n in bands of height of `BAND_M`; row 0 is not used.
+    """The lateral range of segments 1..n in height bands of `BAND_M`; row 0 is not used.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ def split_at_width_changes(
     ----------
     labels : (rows, columns) segments 1..n, 0 elsewhere.
     up : (3,) unit vector, sensor frame.
-    n : the last label before.
+    n : the last label before the split.
     """
     side = lateral_axis(up)
     outlines = _outlines_of(grid, heights.height, graph.spans, labels, n, side)
@@ -137,7 +137,10 @@ def _find_cuts(outlines: Outlines, p: int, cuts: Bool) -> bool:
 
 @kernel(inline=True)
 def _step_at(outlines: Outlines, p: int, band: int) -> float:
-    """Return the sum of the steps of both sides below a band, metres; 0 if both are small."""
+    """Return by how much both sides together step at the lower edge of a band, metres.
+
+    The result is 0 unless one side steps by at least `SegmentationSettings.side_step_m`.
+    """
     total = largest = 0.0
     for k in range(2):
         end = outlines.ends[k, p]
