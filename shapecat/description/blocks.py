@@ -70,7 +70,7 @@ def _slices() -> dict[str, slice]:
 
 
 BLOCKS: dict[str, slice] = _slices()
-"""The slice of each block in the descriptor. ``metric`` and ``view`` depend on the scale."""
+"""The slice of each block in the descriptor. Only ``metric`` and ``view`` depend on the scale."""
 
 DESCRIPTOR_NAMES: tuple[str, ...] = tuple(
     f"{block}.{name}" for block, names in _BLOCK_NAMES.items() for name in names

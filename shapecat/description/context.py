@@ -111,8 +111,8 @@ def context(
     ----------
     normals, curvatures : (3, k) and (2, k), from `fit_surfaces`.
     upright : from `vertical_axis`.
-    low, high : heights of the lowest and highest point, in units of the surface.
-    out : the block ``context``, written in place.
+    low, high : 2nd and 98th percentiles of the heights of the points, in units of the surface.
+    out : the block ``context``, zeros, written in place.
 
     Returns
     -------
@@ -140,7 +140,10 @@ def context(
 
 @kernel(inline=True)
 def _extents(points: F4, height: float, eye: F4, out: F4) -> tuple[float, float, float]:
-    """Compare the height with horizontal widths; return the largest, across and along the view."""
+    """Compare the height with horizontal widths; return three widths.
+
+    They are the largest width, and the widths across and along the line of sight.
+    """
     ex, ey = eye[0], eye[1]
     length = np.sqrt(ex * ex + ey * ey)
     ex, ey = (ex / length, ey / length) if length > 1e-6 else (1.0, 0.0)
@@ -209,7 +212,10 @@ def _harmonics(weight: F4, normals: F4, out: F4) -> None:
 
 @kernel(inline=True)
 def _facing(level: F8, weight: F4, normals: F4, out: F4) -> None:
-    """Write the fractions of the surface that face up, sideways and down."""
+    """Write the fractions of the surface that face up, sideways and down.
+
+    Then follow the fractions that face up near the top and near the bottom.
+    """
     for i in range(level.size):
         w, up = weight[i], normals[2, i]
         out[0] += w * (up > 0.8)
@@ -263,7 +269,7 @@ def _axis(
 
 @kernel(inline=True)
 def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
-    """Write mean, deviation and skew of the heights ``level`` (n,), and the convex fraction."""
+    """Write mean, deviation and skew of heights ``level`` (n,), and the share of convex surface."""
     mean = second = third = 0.0
     for i in range(level.size):
         mean += weight[i] * level[i]

@@ -19,8 +19,8 @@ def assign(points: F4, x: F4, y: F4, z: F4, max_distance: float) -> tuple[F4, I4
     ----------
     points : (3, n) coordinates.
     x, y, z : (k,) positions of the neurons.
-    max_distance : of a point from its neuron, in the same unit. Farther points are dropped: they
-        belong to a part of the object that the graph does not cover.
+    max_distance : largest distance of a point from its neuron, in the same unit. Farther points are
+        dropped: they belong to a part of the object that the graph does not cover.
 
     Returns
     -------
@@ -73,9 +73,9 @@ def fit_surfaces(
 ) -> tuple[F4, F4]:
     """Fit a quadric around each neuron.
 
-    The neighbourhood is all points within a radius of the neuron. The height above its
-    least-squares plane is fitted by a full quadric (ridge regression), and the curvatures follow
-    from the first and second fundamental forms.
+    The neighbourhood is all points within a radius of the neuron. A full quadric is fitted to the
+    heights of these points above their least-squares plane (ridge regression). The curvatures
+    follow from the first and second fundamental forms.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def _normal(
         )
         half = min(1.0, max(-1.0, det / 2))
         smallest = mean + 2 * p * np.cos(np.arccos(half) / 3 + 2 * np.pi / 3)
-        # Its eigenvector is the longest cross product of two rows of (matrix - least).
+        # Its eigenvector is the longest cross product of two rows of matrix - smallest * identity.
         xx, yy, zz = (xx - smallest) / p, (yy - smallest) / p, (zz - smallest) / p
         xy, xz, yz = cxy, cxz, cyz
         a1, b1, c1 = xy * yz - xz * yy, xz * xy - xx * yz, xx * yy - xy * xy

@@ -22,7 +22,7 @@ __all__ = ["describe"]
 
 _MAX_POINTS = 1200
 _GRID_SPACING = 1.15
-"""Spacing of a square grid of the same density, relative to the mean gap."""
+"""Spacing of a square grid with the same density of neurons, relative to their mean gap."""
 _RADIUS = 2.2 * _GRID_SPACING
 """Radius of the neighbourhoods in which curvature is fitted, in mean gaps between neurons."""
 _REACH = 3 * _GRID_SPACING
@@ -166,7 +166,7 @@ def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> Surface:
 
 @kernel(inline=True)
 def _cloud_of(points: F4, center: F8, unit: float) -> F4:
-    """Return every k-th point (3, n) relative to the mean of the neurons, in their unit."""
+    """Return every k-th point (3, n), relative to ``center`` and in units of ``unit``."""
     step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
     total = (points.shape[0] + step - 1) // step
     cloud = np.zeros((3, total), np.float32)

@@ -60,7 +60,10 @@ def _less(a: float, b: float) -> float:
 
 @kernel(fast=True, inline=True)
 def _ways(paths: F4, k: int, via: F4) -> None:
-    """Write the paths of nodes k to k + 3 to ``via``, each shortened through those before."""
+    """Write the path lengths from each of the nodes k to k + 3 to ``via``.
+
+    A path may pass through those of the four nodes that have lower numbers.
+    """
     first, second, third, fourth = paths[k], paths[k + 1], paths[k + 2], paths[k + 3]
     a = second[k]
     b = third[k]

@@ -61,8 +61,9 @@ def _find_bins(lengths: F4, i: int, scale: float, one: float, bins: I4, shares: 
 def distributions(surface: Surface, normals: F4, curvatures: F4, out: F4) -> None:
     """Write the histograms over the whole object, its rings and its bands.
 
-    ``normals`` (3, n) and ``curvatures`` (2, n) are from `fit_surfaces`; ``out`` is the whole
-    descriptor, of which the blocks ``curvature`` to ``band_curvature`` are written.
+    Rings are intervals of the mean geodesic distance to the other neurons; bands are intervals of
+    height. ``normals`` (3, n) and ``curvatures`` (2, n) are from `fit_surfaces`; ``out`` is the
+    whole descriptor, of which the blocks ``curvature`` to ``band_curvature`` are written.
     """
     euclidean, geodesic, weight = surface.euclidean, surface.geodesic, surface.weight
     z = surface.neurons[2]
@@ -133,10 +134,10 @@ def _partition(
     at_euclidean: int,
     at_curvature: int,
 ) -> None:
-    """Write the mean of ``rows`` over each of the equal intervals of ``order``.
+    """Write the mean of ``rows`` over the neurons in each of ``parts`` equal intervals.
 
-    A neuron counts in the two intervals whose middles are nearest, so that a small change of the
-    graph changes the descriptor little.
+    The intervals divide the range of ``order`` (n,). A neuron counts in the two intervals whose
+    middles are nearest, so that a small change of the graph changes the descriptor little.
     """
     low, high = outer_range(order)
     sums = np.zeros((parts, rows.shape[1]))

@@ -1,6 +1,6 @@
 """Small linear systems and eigenvalue problems, solved without SciPy's linear algebra.
 
-Numba would load that for `numpy.linalg`, which takes 0.1 s in each process.
+For `numpy.linalg`, numba would load SciPy's linear algebra, which takes 0.1 s in each process.
 """
 
 import numpy as np
@@ -12,7 +12,8 @@ __all__ = ["principal_axes", "solve"]
 
 _SINGULAR = 1e-10
 _SWEEPS = 8
-"""The Jacobi method doubles the valid digits with each sweep; five usually suffice."""
+"""Number of sweeps of the Jacobi method. Each sweep doubles the valid digits; five usually
+suffice."""
 
 
 @kernel(inner=True)
@@ -46,9 +47,9 @@ def solve(A: F8, b: F8) -> None:
 
 @kernel(inner=True)
 def principal_axes(A: F8) -> tuple[F8, F8]:
-    """Return the eigenvalues (3,) and eigenvectors (3, 3) of a symmetric matrix; it is overwritten.
+    """Return the eigenvalues (3,) and eigenvectors (3, 3) of a symmetric matrix ``A`` (3, 3).
 
-    The values ascend; the vectors are the columns, of either sign.
+    The values ascend; the vectors are the columns, of either sign. ``A`` is overwritten.
 
     Source: Golub and Van Loan 2013, 8.5 (Jacobi rotations).
     """

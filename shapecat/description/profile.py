@@ -21,7 +21,8 @@ class VerticalAxis(NamedTuple):
     Attributes
     ----------
     x, y : its position.
-    residual : root mean square distance from it of the horizontal lines in `vertical_axis`.
+    residual : root mean square distance between this line and the horizontal lines to which
+        `vertical_axis` fits it.
     """
 
     x: float
@@ -81,14 +82,15 @@ def profile(
 
     The features of each of 8 horizontal slices are its fraction of the points, the mean radius and
     its standard deviation (relative to the largest mean radius), the fraction of the points that
-    face the axis, the mean of the normals' z, and the mean curvature.
+    face the axis (the steeper the surface, the more they count), the mean of the normals' z, and
+    the mean curvature, mapped to -1 to 1.
 
     Parameters
     ----------
     normals, curvatures : (3, n) and (2, n), from `fit_surfaces`.
     upright : from `vertical_axis`.
-    low, high : heights of the lowest and highest point, in units of the surface.
-    out : the block ``profile``, written in place.
+    low, high : 2nd and 98th percentiles of the heights of the points, in units of the surface.
+    out : the block ``profile``, zeros, written in place.
     """
     x, y, z = surface.neurons[0], surface.neurons[1], surface.neurons[2]
     weight = surface.weight

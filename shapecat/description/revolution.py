@@ -81,8 +81,9 @@ def revolution(surface: Surface, normals: F4, axis: F8, point: F8, foot: F8, out
 def fit_axis(neurons: F4, weight: F4, normals: F4, axis: F8, point: F8, free: int) -> None:
     """Fit an axis such that the radius of the neurons is constant in each slice along it.
 
-    Gauss-Newton steps reduce the deviations of the radius from the mean of its slice, which is
-    eliminated (Golub and Pereyra 1973). Neurons whose normal is along the axis have no weight.
+    Gauss-Newton steps reduce the deviations of the radii from the mean radius of their slice. The
+    mean radii are eliminated from the unknowns (Golub and Pereyra 1973). Neurons whose normal is
+    along the axis have no weight.
 
     Parameters
     ----------

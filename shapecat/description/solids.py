@@ -57,7 +57,7 @@ def solids(
     x, y : (k,) positions of the neurons.
     normals : (3, k) unit vectors.
     eye : (3,) position of the sensor.
-    low, high : heights of the lowest and highest point.
+    low, high : 2nd and 98th percentiles of the heights of the points.
     revolved : the block ``revolution``, already written.
     out : the block ``solids``, written in place.
     """
@@ -111,7 +111,7 @@ def _box_frame(cloud: F4, x: F4, y: F4, normals: F4, eye: F4) -> tuple[F4, F4]:
 
 @kernel(inline=True)
 def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, out: F4) -> None:
-    """Compare points with the three faces of a box that the sensor can see."""
+    """Compare the points with the three faces of a box that the sensor can see."""
     count = u.size
     low_u, high_u = inner_range(u)
     low_v, high_v = inner_range(v)
