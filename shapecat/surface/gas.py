@@ -16,20 +16,22 @@ __all__ = ["MIN_POINTS", "reconstruct"]
 MIN_POINTS = 24
 """Minimum number of points from which a surface is learned."""
 _MAX_POINTS = 1200
-"""Maximum number of points used, every k-th of a larger cloud: more only make the gas slower."""
+"""Maximum number of points used, every k-th of a larger cloud. More points only take longer."""
 _NEURONS_PER_POINT = 0.45
 _FEWEST_NEURONS = 12
 _SPACING_SAMPLES = 64
-"""Approximate number of points whose distance to the nearest one is averaged."""
+"""Approximate number of points whose distance to the nearest other point is averaged."""
 _RATES = Rates(winner=0.1, neighbour=0.006, oldest=30)
 _GROWTH = 0.6
 """Fraction of the signals within which all neurons are inserted."""
 _EPOCHS = 8
 """Maximum number of epochs of the thesis's rule, which rarely reaches its distance limit sooner."""
 _ERROR_LIMIT = 3.0
-"""t_gamma, relative to the error per epoch of a neuron with an equal share of the surface."""
+"""Error limit (t_gamma in the thesis), relative to the error that a neuron collects in an epoch if
+all neurons have equal shares of the surface."""
 _DISTANCE_LIMIT = 0.7
-"""t_alpha, relative to the spacing of the points: smaller distances are noise."""
+"""Distance limit (t_alpha in the thesis), relative to the spacing of the points: smaller distances
+are noise."""
 
 
 def reconstruct(
@@ -90,7 +92,7 @@ def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float)
     interval = int(_GROWTH * signals) // target
     _link_two_points(cloud, gas, state)
     count = grow_fritzke(cloud, state, gas, target, signals, max(interval, 1), _RATES)
-    adjacent = finish_graph(cloud, gas, int(count), share)  # int: else also for a literal 2
+    adjacent = finish_graph(cloud, gas, int(count), share)  # int(): else numba compiles it twice
     return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent)
 
 
@@ -100,7 +102,8 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U
     cloud, frame = _normalise(points)
     target = _target_size(cloud, neurons)
     # differs: a bound on the neurons, for memory; and thresholds relative to the object. If a
-    # neuron's share of the surface is a square of side h, its mean squared distance is h**2 / 6.
+    # neuron's share of the surface is a square of side h, the mean squared distance of its points
+    # is h**2 / 6.
     gas = empty_gas(2 * target)
     state = np.uint64(seed)
     _link_two_points(cloud, gas, state)
@@ -112,15 +115,15 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U
         _ERROR_LIMIT * each * square / 6, _DISTANCE_LIMIT * spacing,
         _RATES,
     )  # fmt: skip
-    adjacent = finish_graph(cloud, gas, int(count), share)  # int: else also for a literal 2
+    adjacent = finish_graph(cloud, gas, int(count), share)  # int(): else numba compiles it twice
     return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent)
 
 
 @kernel(inner=True)
 def _normalise(points: F4) -> tuple[Cloud, F8]:
-    """Return at most `_MAX_POINTS` points, scaled to -1 to 1, and four numbers to undo it.
+    """Return at most `_MAX_POINTS` points, shifted and scaled to -1 to 1; and shift and scale (4,).
 
-    These are x, y, z of the mean, and the largest distance from it along an axis.
+    These are x, y, z of the mean, and the largest distance from the mean along an axis.
     """
     step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
     size = (points.shape[0] + step - 1) // step

@@ -1,4 +1,4 @@
-"""From a grown gas to a connected graph of the surface, in which every neuron is used."""
+"""Turn a grown gas into a connected graph in which every neuron is nearest to some point."""
 
 import numpy as np
 
@@ -11,9 +11,10 @@ from shapecat.surface.simd import LANES, three_nearest
 __all__ = ["GRID_SPACING", "edge_list", "finish_graph"]
 
 GRID_SPACING = 1.15
-"""Spacing of a square grid of the same density, relative to the mean nearest distance."""
+"""Spacing of a square grid with the same density of points, relative to the mean distance from a
+point to its nearest neighbour."""
 _LONGEST = 3.0
-"""Longest edge between neurons that are not the two nearest of a point, in spacings."""
+"""Maximum length, in grid spacings, of an edge that step 3 adds for the third nearest neuron."""
 
 
 @kernel

@@ -24,7 +24,8 @@ __all__ = ["Cloud", "Rates", "grow_fritzke", "grow_thesis"]
 
 
 _GAIN = 1 / 0.9995
-"""Weight of an error relative to that of the previous signal: errors decay by 0.9995 a signal."""
+"""Weight of an error relative to that of the signal before: with each signal, the errors so far
+decay to 0.9995 of their size."""
 
 
 class Cloud(NamedTuple):
@@ -54,8 +55,8 @@ class Rates(NamedTuple):
 def _drop_old_edges(degree: I4, wins: I4, edge_birth: I4, count: int, a: int, oldest: int) -> None:
     for j in range(count):
         age = wins[a] + wins[j] - edge_birth[a * degree.size + j]
-        # differs: an edge stays when it is the last of either end, so that no neuron is ever
-        # isolated and none has to be removed.
+        # differs: an edge stays if it is the last edge of one of its neurons, so that no neuron is
+        # ever isolated and none has to be removed.
         if age > oldest and degree[a] > 1 and degree[j] > 1:
             disconnect(degree, edge_birth, a, j)
 
@@ -124,7 +125,7 @@ def grow_fritzke(
     interval: int,
     rates: Rates,
 ) -> int:
-    """Adapt a gas of two neurons to signals from a cloud, and insert more; return their number.
+    """Adapt a gas of two neurons to signals from a cloud and insert more; return how many it has.
 
     Source: Fritzke 1995, thesis Algorithm 3, whose steps are numbered here and in
     `_adapt_to_signal`; steps 1 to 3 are the caller's.
@@ -197,7 +198,7 @@ def grow_thesis(
     distance_limit: float,
     rates: Rates,
 ) -> int:
-    """Grow a gas of two neurons until they are close to the points; return the number of neurons.
+    """Grow a gas of two neurons until its neurons are close to the points; return their number.
 
     Source: thesis 5.2, Algorithm 4, which changes two steps of Algorithm 3. Step 12: a neuron is
     inserted where the error exceeds a limit. Step 18: the cloud is presented again until the mean
@@ -254,7 +255,7 @@ def grow_thesis(
 
 @kernel(inline=True)
 def _prune(gas: Gas, count: int, before: I4) -> int:
-    """Remove neurons that have not won since ``before``, down to 3; return the number left."""
+    """Remove neurons whose ``wins`` are still as in ``before``, but keep 3; return their number."""
     i = 0
     while i < count:
         if gas.wins[i] != before[i] or count <= 3:

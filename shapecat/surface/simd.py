@@ -77,7 +77,10 @@ class _Vectors:
 
     @contextmanager
     def blocks(self, count: _Value) -> Iterator[tuple[_Value, _Value]]:
-        """Loop over blocks of `LANES` elements; yield the index of the first, and of each lane."""
+        """Emit a loop over blocks of `LANES` elements, whose body the caller emits.
+
+        Yields the index of the first element of a block, and the vector of all its indices.
+        """
         build = self.build
         first, lane = self.variable(_I64(0)), self.variable(ir.Constant(_INTS, [*range(LANES)]))
         test, body, end = (build.append_basic_block(name) for name in ("test", "body", "end"))

@@ -22,9 +22,9 @@ _SQUARINGS = 6
 def thin(points: F4, *, settings: SurfaceSettings) -> F4:
     """Thin the points of an object for the gas: return (m, 3) metres, one point for each voxel.
 
-    The points of a voxel are averaged, then smoothed if the settings ask for it. differs: the
-    thesis smooths the whole cloud before thinning; smoothing the thinned points of an object takes
-    a hundredth of the time, and removes the noise that the averages leave.
+    The points of each voxel are averaged, and the averages are smoothed if the settings ask for it.
+    differs: the thesis smooths the whole cloud before thinning; smoothing the thinned points of an
+    object takes a hundredth of the time, and removes the noise that the averages leave.
 
     Parameters
     ----------
@@ -87,10 +87,10 @@ def smooth(points: F4, *, radius_m: float) -> F4:
 
 
 def _cells(points: F4, radius: float) -> tuple[I4, I4]:
-    """Return the cell (n,) of each point in a grid with the radius as spacing, and its size (3,).
+    """Return the cell (n,) of each point in a grid of spacing ``radius``, and the grid's size (3,).
 
-    Cells are numbered with z fastest. The grid has an empty border, so that the numbers before and
-    after a cell's are its neighbours in space.
+    Cells are numbered with z fastest. The grid has an empty border, so that the cells with the next
+    lower and the next higher number are always neighbours along z.
     """
     place = ((points - points.min(axis=0).astype(np.float64)) / radius).astype(np.int64) + 1
     size = place.max(axis=0) + 2
@@ -124,9 +124,9 @@ def _smooth(points: F4, radius: float, cells: I4, size: I4, order: I4) -> F4:
 def _neighbours(
     points: F4, i: int, radius: float, cell: int, size: I4, keys: I4, order: I4, offsets: F8
 ) -> int:
-    """Write offsets from point i, in radii, and weights of its neighbours to ``offsets``.
+    """Write the neighbours of point i to ``offsets``, and return their number.
 
-    Returns their number.
+    A row is the offset of a neighbour from the point, in radii, and the weight of the neighbour.
     """
     n = 0
     for side in range(9):
@@ -146,7 +146,7 @@ def _neighbours(
 
 @kernel(inline=True)
 def _plane(offsets: F8, n: int) -> tuple[F8, float]:
-    """Return the normal of the plane of weighted points, and its height above the origin."""
+    """Return the normal of the plane fitted to weighted points, and the plane's height over 0."""
     mean, spread = np.zeros(3), np.zeros((3, 3))
     total = 0.0
     for k in range(n):
@@ -168,7 +168,7 @@ def _plane(offsets: F8, n: int) -> tuple[F8, float]:
 def _least_direction(spread: F8) -> F8:
     """Return the unit eigenvector of the smallest eigenvalue of a symmetric (3, 3) matrix.
 
-    It belongs to the largest eigenvalue of the adjugate, and so dominates the adjugate's powers.
+    This vector belongs to the largest eigenvalue of the adjugate, whose powers converge to it.
     """
     power = np.zeros((3, 3))
     for a in range(3):

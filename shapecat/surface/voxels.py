@@ -8,7 +8,8 @@ from shapecat.jit import kernel
 __all__ = ["read_only", "voxelize"]
 
 _FRACTION_BITS = 16
-"""Coordinates are summed as integers, in units of 2**-16 voxels: the order does not matter."""
+"""Coordinates are summed as integers, in units of 2**-16 voxels, so that their order does not
+matter."""
 _RADIX_BITS = 11
 _LARGEST = np.int64(1 << 62)
 
@@ -17,7 +18,8 @@ def voxelize(points: F4, *, voxel_m: float) -> F4:
     """Average the points of each cubic voxel.
 
     The grid is anchored at the origin. Centroids are sorted by voxel (x slowest, z fastest), so
-    the result depends on the set of points and not on their order, to the last bit.
+    the result depends on the set of points and not on their order, to the last bit. The time is
+    linear in the number of points.
 
     Parameters
     ----------
@@ -26,7 +28,7 @@ def voxelize(points: F4, *, voxel_m: float) -> F4:
 
     Returns
     -------
-    (m, 3) one centroid for each voxel that holds a point; m <= n. Linear time.
+    (m, 3) one centroid for each voxel that holds a point; m <= n.
 
     Raises
     ------
