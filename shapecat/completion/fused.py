@@ -12,11 +12,11 @@ from shapecat.completion.whole import faced, footprint
 __all__ = ["BoxViews", "FusedBox", "fuse_boxes"]
 
 _STILL_M = 0.05
-"""While the centre moves less than this, the object stands still."""
+"""While the centre moves less than this, metres, the object stands still."""
 _TURNED_DEG = 20.0
 """Smallest turn of an object that counts, degrees."""
 _ROUND = 0.2
-"""Elongation below which no side is the longer one."""
+"""Elongation below which neither side counts as the longer one."""
 _STEADY = 0.7
 """Minimum length of the mean of unit vectors that agree."""
 _NEIGHBOURS = 2
@@ -24,11 +24,12 @@ _NEIGHBOURS = 2
 _TRIED = 16
 """Maximum number of views whose yaw is tried."""
 _NARROWEST = 0.5
-"""Minimum width of the overlaid outline, as a fraction of the narrowest view."""
+"""Minimum width of the overlaid outline, as a fraction of the width in the narrowest view."""
 _UNSEEN = 0.05
 """Weight of an outline in directions that do not face the sensor; in those that do it is 1."""
 _SQUARE = 0.2
-"""Weight of the yaw of a square footprint; the elongation of a footprint adds to it."""
+"""Weight of the yaw of a square footprint. The weight of any footprint is this plus its
+elongation."""
 _COMMON = 0.5
 """Fraction of a view's variance that all views have in common, as they see the same side."""
 
@@ -122,9 +123,9 @@ def fuse_boxes(views: BoxViews, weights: F8, posterior: F8, categories: Sequence
 
 
 def _resting(centers: F8, weights: F8) -> int:
-    """Return the most central view of those that show the object where it stands longest.
+    """Return the most central of the views that show the object where it stands longest.
 
-    While an object is carried, it is not on its support, which the estimate of boxes needs.
+    Views of a carried object are avoided: the estimate of a box assumes an object on its support.
     """
     distances = np.linalg.norm(centers - _median(centers, weights), axis=1)
     first = int(distances.argmin())
@@ -178,7 +179,7 @@ def _turned_from(base: F8, elongation: float, axes: F8, sizes: F8) -> Bool:
 
 
 def _yaws(base: F8, axes: F8) -> F8:
-    """Return the yaws (k,) of boxes with the axes (k, 3, 3) in a box with the axes ``base``."""
+    """Return the yaws (k,), radians, of boxes with ``axes`` (k, 3, 3), relative to ``base``."""
     x, y, _ = (axes[:, :, 0] @ base).T
     return np.asarray(np.arctan2(y, x))
 
@@ -186,24 +187,24 @@ def _yaws(base: F8, axes: F8) -> F8:
 def _elongation(sizes: F8) -> F8:
     """Return how much longer boxes (k, 3) are along their first axis than along the second: (k,).
 
-    It is -1 to 1, and 0 for a square.
+    The difference is a fraction of the longer side: -1 to 1, and 0 for a square.
     """
     length, width = sizes[:, 0], sizes[:, 1]
     return np.asarray((length - width) / np.maximum(np.maximum(length, width), 1e-6))
 
 
 def _mean_axes(axes: F8, sizes: F8, weights: F8) -> F8:
-    """Return the first of some axes (k, 3, 3), turned to the mean yaw modulo 90 degrees."""
+    """Return the first of the axes (k, 3, 3), turned to the mean yaw of all, modulo 90 degrees."""
     first = axes[0]
     total = np.sum(weights * (_SQUARE + abs(_elongation(sizes))) * np.exp(4j * _yaws(first, axes)))
     return np.asarray(first @ _about_z(float(np.angle(total)) / 4))
 
 
 def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F8]:
-    """Return the median outline about ``origin``, and how many views see each direction.
+    """Return the median outline about ``origin``, and the fraction of views seeing each direction.
 
-    The second is a fraction of the views. Both are (96,), from the first of the axes ``base`` to
-    the second.
+    Both are (96,). The directions begin at the first of the axes ``base``, and turn towards the
+    second.
     """
     around = _turned(views.outlines, _yaws(base, views.axes))
     positions = (views.centers - origin) @ base
@@ -216,8 +217,8 @@ def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F
     outlines = np.where(complete[:, None], outlines, np.maximum(outlines, complete_outline))
     share = (weights[:, None] * facing).sum(axis=0) / weights.sum()
     median = _median(outlines, view_weights)
-    # Of a thin object that moves a little, opposite sides may come from views that exclude each
-    # other.
+    # If a thin object moves a little, its opposite sides may come from views whose outlines do not
+    # overlap.
     min_width = _NARROWEST * _widths(outlines).min(axis=0)
     return median + np.maximum(min_width - _widths(median), 0.0) / 2, share
 
@@ -238,7 +239,7 @@ def _turned(outlines: F8, angles: F8) -> F8:
 
 
 def _alike(axes: F8, sizes: F8, size: F8) -> F8:
-    """Return axes (k, 3, 3), turned by 90 degrees where ``size`` has length and width swapped."""
+    """Return axes (k, 3, 3), turned by 90 degrees where the longer side is not that of ``size``."""
     swapped = (sizes[:, 0] < sizes[:, 1]) != (size[0] < size[1])
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     return np.where(swapped[:, None, None], axes @ quarter, axes)

@@ -74,7 +74,7 @@ def support_function(
 
 @kernel(inline=True)
 def _overshoot(x: F4, y: F4, a: float, b: float, top: float, noise: float, flat: float) -> float:
-    """Return the distance of ``top`` beyond the mean of its side; less if the side is curved."""
+    """Return how far ``top`` is beyond the mean of its side; reduced if the side is not flat."""
     count, total = 0, 0.0
     for i in range(x.size):
         below = top - (a * x[i] + b * y[i])

@@ -29,11 +29,12 @@ _TOP = 0.98
 _NOISY_M = 0.004
 """Largest height by which noise lifts points of a flat top, metres."""
 _FLAT = 1 / 3
-"""Fraction of the points that make a face flat."""
+"""Fraction of the points from which a face counts as flat."""
 _HANDLE = 0.06
 """Minimum length by which a handle sticks out of a cup's oval, as a fraction of the radius."""
 _EDGEWISE = -0.2
-"""Cosine of the angle to the sensor above which an outline is visible: just past edge-on."""
+"""Minimum cosine between the direction to the sensor and a direction in which the outline is
+visible: just past edge-on."""
 _THINNEST_M = 0.005
 """Minimum length of a box: a face that the sensor sees straight on shows no thickness."""
 _NOISE_M = 0.006
@@ -49,11 +50,11 @@ class _OutlinePrior(NamedTuple):
 
     Attributes
     ----------
-    stray : fraction of the points that noise and mixed pixels put outside the outline: less where
-        the surface curves away than where many points lie on the outline, as on a wall.
+    stray : fraction of the points that noise and mixed pixels put outside the outline. It is
+        smaller if the surface curves away than if many points lie on the outline, as on a wall.
     noise : metres, the spread of the depths on a flat side.
-    roundness : weight of the prior for a circle, as a number of directions: one side says little
-        about the depth.
+    roundness : weight of the prior for a circle, as a number of directions. A prior is needed
+        since the visible side says little about how deep the object is.
     fits : largest deviation of the visible side from an accepted oval, as a fraction of its radius.
     """
 
