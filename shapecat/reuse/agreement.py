@@ -85,7 +85,7 @@ def _compare(
         if c < NEAREST_M:
             compared += 1
             continue
-        has_depth, difference = _nearest_reading(
+        has_depth, difference = _difference_at(
             other, int(np.floor(gy * b / c + ay + 0.5)), int(np.floor(gx * a / c + ax + 0.5)), 1 / c
         )
         if has_depth:
@@ -97,11 +97,11 @@ def _compare(
 
 
 @kernel(inline=True)
-def _nearest_reading(depth: F4, row: int, column: int, expected: float) -> tuple[bool, float]:
-    """Return whether there is depth, and its inverse minus the expected one.
+def _difference_at(depth: F4, row: int, column: int, expected: float) -> tuple[bool, float]:
+    """Return whether a pixel has depth, and its inverse depth minus the expected one, 1/m.
 
     If the pixel itself does not agree, its best neighbour counts: at an edge, the outline may be
-    off by a pixel. Outside the image there is depth with an infinite difference.
+    off by a pixel. Outside the image, the result is (True, infinity): nothing agrees there.
     """
     height, width = depth.shape
     if not (0 <= row < height and 0 <= column < width):

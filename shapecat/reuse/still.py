@@ -10,14 +10,14 @@ from shapecat.types import Frame, Pose
 __all__ = ["shows_the_same"]
 
 _MOVED_M = 0.003
-"""Largest distance between two poses that count as equal, metres: it is noise."""
+"""Largest distance between two poses that count as equal, metres: so much is noise."""
 _TURNED_DEG = 0.15
-"""Largest angle between two such poses, degrees."""
+"""Largest angle between two poses that count as equal, degrees."""
 _STRIDE = 2
 """Step between the pixels that are compared."""
 _SQUARE = 3
-"""Side of the square of compared pixels that must all differ to show a change: 6 by 6 pixels, less
-than the smallest object has. Noise at outlines makes only thin lines."""
+"""Side of a square of compared pixels that shows a change if all of them differ. It covers 6 by 6
+pixels, fewer than the smallest object has. Noise at outlines makes only thin lines."""
 
 
 def shows_the_same(
@@ -78,9 +78,9 @@ def _mark(depth: F4, key_depth: F4, range_m: float, differs: Bool) -> None:
 
 @kernel(inline=True)
 def _alone(depth: F4, key_depth: F4, row: int, column: int) -> bool:
-    """Return whether neither depth of a pixel occurs in the other image, there or beside it.
+    """Return whether neither image has the depth of the other at a pixel or beside it.
 
-    Two missing depths are equal.
+    If both depths are missing, the result is False.
     """
     a, b = depth[row, column], key_depth[row, column]
     return a != b and not (

@@ -38,11 +38,12 @@ _UP_DEG = 2.0
 _AREA = 0.25
 """Largest change of the number of pixels due to noise, at the same distance, as a fraction."""
 _AGREE = 0.95
-"""Minimum fraction of the points of either view that must agree with the other view."""
+"""Minimum fraction of the points of each view that must agree with the other view."""
 _BIAS = 0.002
-"""Largest mean difference of their inverse depths, 1/m: 2 mm at 1 m."""
+"""Largest mean difference between the inverse depths of two views, 1/m: 2 mm at 1 m."""
 _TRIES = 3
-"""Number of earlier views to compare point by point, the newest first: masks may flicker."""
+"""Maximum number of earlier views to compare point by point, the newest first. The newest may
+disagree only because its mask flickered."""
 _SUMMARY = np.dtype(
     [
         ("center_m", "f8", 3),  # of the box, in the fixed frame; the sensor frame without one
@@ -54,7 +55,7 @@ _SUMMARY = np.dtype(
         ("kind", "i8"),  # flags that must be equal
     ]
 )
-"""What is compared before the points."""
+"""The summary of a view. Points are compared only between views with similar summaries."""
 
 
 class ObjectView(NamedTuple):
@@ -186,7 +187,7 @@ def _moved_box(move: Move, box: FullBox | None) -> FullBox | None:
 
 
 def _similar(views: Records, keys: Records) -> Bool:
-    """Return which pairs of `ObjectView.summary` are alike, of the common shape of both."""
+    """Return which pairs of summaries are alike; the two arrays are broadcast to one shape."""
     ray, key_ray = views["ray_m"], keys["ray_m"]
     distance, key_distance = np.linalg.norm(ray, axis=-1), np.linalg.norm(key_ray, axis=-1)
     area = views["pixels"] * distance**2 / (keys["pixels"] * key_distance**2)
