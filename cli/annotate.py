@@ -5,6 +5,8 @@ from typing import Any
 
 import click
 
+from shapecat.outputs.counts import plural
+
 from .options import ANY_PATH, boxes_option
 from .render import changed_labels, missed_words, progress_bars
 
@@ -58,6 +60,7 @@ def annotate(
         click.echo(f"{run}: {changes}")
     if transfer is not None:
         _show(transfer.as_dict(), labels)
+    _warn_of_far_merges(run)
 
 
 def _labels_of(run: Path) -> dict[int, str]:
@@ -69,6 +72,21 @@ def _labels_of(run: Path) -> dict[int, str]:
         return read_track_table(run / "tracks.csv").labels
     except OutputError:
         return {}
+
+
+def _warn_of_far_merges(run: Path) -> None:
+    """Print to stderr the merged tracks that are too far apart to be one object."""
+    from shapecat.errors import listed
+    from shapecat.runs.finished import read_finished
+    from shapecat.runs.labels.far_merges import far_merges
+
+    if gaps := far_merges(run, read_finished(run).labels):
+        pairs = [
+            f"#{a} and #{b} ({100 * distance:.0f} cm apart in {plural(frames, 'frame')})"
+            for (a, b), frames, distance in gaps
+        ]
+        text = "merged tracks are in different places at the same time"
+        click.echo(f"Warning: {text}: {listed(pairs)}; check the labels", err=True)
 
 
 def _show(transfer: dict[str, Any], labels: Path | None) -> None:

@@ -623,6 +623,7 @@ def test_annotate_reports_written_files_and_untransferred_labels(
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("shapecat.pipeline.annotate_again", stub)
+    monkeypatch.setattr("shapecat.cli.annotate._warn_of_far_merges", lambda _run: None)
     Path("lab").mkdir()
     options = ("--by-place", "--boxes", "visible", "--recording", "r.bag")
     words = ("annotate", "lab", "--labels", "t.csv", *options)

@@ -120,6 +120,7 @@ JUDGED_BY: dict[str, Sequence[str]] = {
     "shapecat.runs.folder": ("test_run_folder", "test_batch_planning"),
     "shapecat.runs.full_boxes": ("test_tables_rotated", "test_completion"),
     "shapecat.runs.labels": ("test_outputs_worked", "test_labels", "test_label_transfer"),
+    "shapecat.runs.labels.far_merges": ("test_far_merges",),
     "shapecat.runs.labels.same_objects": ("test_label_transfer",),
     "shapecat.runs.labels.track_table": ("test_labels", "test_label_transfer"),
     "shapecat.runs.labels.transfer": ("test_label_transfer",),

@@ -25,6 +25,7 @@ from shapecat.outputs.report.cards import (
 )
 from shapecat.outputs.report.pictures import StripFrame
 from shapecat.runs.finished import FinishedRun
+from shapecat.runs.labels.far_merges import Gap
 from shapecat.runs.labels.track_table import TrackTable
 from shapecat.types import CATEGORIES, UNKNOWN
 
@@ -60,6 +61,7 @@ def run_page(
     *,
     length_s: float,
     notes: Sequence[str] = (),
+    apart: Sequence[Gap] = (),
     index: str | None = None,
     served: bool = False,
 ) -> str:
@@ -72,6 +74,7 @@ def run_page(
     stages : (frames,) seconds of each stage.
     length_s : time from the first to the last frame, seconds.
     notes : warnings to show after those of the run.
+    apart : tracks in different places in the same frames; merging them gives a warning.
     index : link to the index of several runs; None if there is none.
     served : whether corrections are sent to a server; if not, the page offers a table to download.
     """
@@ -106,7 +109,7 @@ def run_page(
         facts=_facts(run),
         glossary=asset("glossary.html"),
         names="".join(f'<option value="{escape(name)}">' for name in names),
-        data=_data(names, run, table, served=served),
+        data=_data(names, run, table, apart, served=served),
     )
 
 
@@ -222,7 +225,14 @@ def _facts(run: Mapping[str, Any]) -> str:
     )
 
 
-def _data(names: Sequence[str], run: Mapping[str, Any], table: TrackTable, *, served: bool) -> str:
+def _data(
+    names: Sequence[str],
+    run: Mapping[str, Any],
+    table: TrackTable,
+    apart: Sequence[Gap],
+    *,
+    served: bool,
+) -> str:
     """Return the data for the script as JSON, escaped so that it cannot end the script element."""
     rows = [
         {
@@ -233,6 +243,10 @@ def _data(names: Sequence[str], run: Mapping[str, Any], table: TrackTable, *, se
         }
         for row in table.rows
     ]
+    distances: dict[int, dict[int, int]] = {}
+    for gap in apart:
+        for track, other in (gap.tracks, gap.tracks[::-1]):
+            distances.setdefault(track, {})[other] = round(100 * gap.distance_m)
     content = {
         "columns": table.columns,
         "rows": rows,
@@ -240,6 +254,7 @@ def _data(names: Sequence[str], run: Mapping[str, Any], table: TrackTable, *, se
         "known": [UNKNOWN, *CATEGORIES, *run["model"]["categories"]],
         "oneFrame": run["fixed_frame"] is not None,
         "colours": {name: hex_colour(name) for name in names},
+        "apart": distances,
         "served": served,
         "key": _key(run, table),
     }
