@@ -113,10 +113,10 @@ def test_uncertain_labels_are_not_shown_as_certain(run: Path, drawn: RunReport) 
 def test_page_shows_current_labels(run: Path, drawn: RunReport) -> None:
     """A server uses the same report for hours, while other programs edit tracks.csv."""
     report = replace(drawn, folder=run)
-    before = report.page(), report.listed("").categories
+    before = report.page(), report.listed("").tally.categories
     track = read_track_table(run / "tracks.csv").rows[0].track
     relabel(run, {track: "teapot"})
-    after = report.page(), report.listed("").categories
+    after = report.page(), report.listed("").tally.categories
 
     assert ["teapot" in page for page, _ in (before, after)] == [False, True]
     assert [counts["teapot"] for _, counts in (before, after)] == [0, 1]
@@ -1000,6 +1000,6 @@ def test_run_without_tracks_has_a_page(run: Path, monkeypatch: pytest.MonkeyPatc
     pq.write_table(table.slice(0, 0), run / "tracks.parquet")
     (report,) = read_reports([run]).runs
 
-    assert report.listed("x").categories.total() == 0
+    assert report.listed("x").tally.categories.total() == 0
     assert "<article" not in report.page()
     assert report.page().count('class="frame"') == 8

@@ -1,8 +1,11 @@
 """Tests of the numbers on the pages of a report, worked out by hand."""
 
+import base64
+import io
 import json
 import re
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,10 +14,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 
 from shapecat.colour.masks import Mask
+from shapecat.outputs.colours import colour_of
+from shapecat.outputs.png import png
 from shapecat.outputs.report import choosing
-from shapecat.outputs.report.cards import Card, _few, card_html
+from shapecat.outputs.report.cards import Card, Tally, _few, card_html
 from shapecat.outputs.report.choosing import Choice, _areas, choose_frames
 from shapecat.outputs.report.images import Crop, FramePicture, _border_share, _hidden_share, encode
 from shapecat.outputs.report.page import Listed, _strip, index_page, run_page
@@ -26,7 +32,7 @@ from shapecat.outputs.report.pictures import (
     _points,
     _strip_frame,
 )
-from shapecat.outputs.report.surfaces import Snapshot, SurfaceDrawing, draw
+from shapecat.outputs.report.surfaces import Snapshot, SurfaceDrawing, _palette, _uri, draw
 from shapecat.outputs.report.tracks import Detected, Timeline, read_timelines
 from shapecat.outputs.report.writing import RunReport, _faces, read_report
 from shapecat.runs.finished import FinishedRun, read_finished
@@ -199,7 +205,7 @@ def test_run_page_has_right_values(*, served: bool) -> None:
     assert re.findall(r'<option value="(unknown|cup|can|box|mug)">', text) == [
         "unknown", "cup", "can", "box", "mug"
     ]  # fmt: skip
-    assert re.findall(r'data-category="(\w+)" aria-pressed', text) == ["can"]
+    assert re.findall(r'data-category="(\w+)" aria-pressed', text) == ["mug"]
     data = json.loads(re.findall(r'id="data">(.*?)</script>', text)[0])
     assert data["served"] is served
     assert data["categories"] == ["unknown", "cup", "can", "box", "mug"]
@@ -277,7 +283,9 @@ def test_index_sums_its_runs() -> None:
     for k, (frames, unsure, checked) in enumerate([(7, 2, 5), (40, 1, 0)]):
         counts = Counter({"cup": 3 + k, "can": 6})
         info = {"counts": {"frames": frames}, "seconds": {"total": 12.34}, "warnings": ["x"] * k}
-        listed.append(Listed(f"{k}.html", f"run {k}", info, counts, unsure, checked, ("data:p",)))
+        listed.append(
+            Listed(f"{k}.html", f"run {k}", info, Tally(counts, unsure, checked), ("data:p",))
+        )
     text = index_page("runs", listed)
 
     tiles = dict(re.findall(r"<dt>(\w+)</dt><dd>(\d+)</dd>", text))
@@ -295,7 +303,7 @@ def test_index_orders_categories_of_equal_counts() -> None:
     """Labels come from a set, whose order differs from one process to the next."""
     info = {"counts": {"frames": 1}, "seconds": {}, "warnings": []}
     pages = [
-        index_page("runs", [Listed("0.html", "run 0", info, Counter(names), 0, 0, ())])
+        index_page("runs", [Listed("0.html", "run 0", info, Tally(Counter(names), 0, 0), ())])
         for names in (["cup", "can", "box", "box"], ["box", "can", "cup", "box"])
     ]
 
@@ -315,7 +323,7 @@ def test_index_counts_tracks_left_to_check(run: Path) -> None:
     for file in ("tracks.original.csv", "tracks.csv"):
         (run / file).write_text("\n".join(table) + "\n")
 
-    listed = RunReport(run, "", read_timelines(run), Pictures({}, []), {}, 0.0).listed("x")
+    listed = RunReport(run, "", read_timelines(run), Pictures({}, []), {}, 0.0).listed("x").tally
     assert (listed.unsure, listed.checked) == (2, 2)
     assert listed.categories == {"can": len(rows) - 2, "cup": 2}
 
@@ -330,7 +338,7 @@ def test_merged_tracks_count_once_in_index(run: Path) -> None:
         cells = rows[k].split(",")
         rows[k] = ",".join([*cells[:at], label, *cells[at + 1 :]])
     (run / "tracks.csv").write_text("\n".join(rows) + "\n")
-    listed = RunReport(run, "", read_timelines(run), Pictures({}, []), {}, 0.0).listed("x")
+    listed = RunReport(run, "", read_timelines(run), Pictures({}, []), {}, 0.0).listed("x").tally
 
     assert listed.categories["mug"] == 1
     assert listed.categories.total() == len(names) - 3
@@ -567,19 +575,50 @@ def test_drawings_show_sensor_side_and_top_view() -> None:
     assert high[1] < middle[1] < low[1]
 
 
+def thumbnails(
+    found: Sequence[tuple[str, float]],
+    labels: Mapping[int, TrackLabel],
+    missing: Sequence[int] = (),
+) -> list[tuple[int, tuple[int, ...]]]:
+    """Return the number and colour of each thumbnail of tracks with these categories.
+
+    Pictures are told apart by their widths. Those of the tracks in ``missing`` are missing.
+    """
+    line = Timeline(np.zeros(0), np.zeros(0, bool), np.zeros((0, 3)), (), np.zeros(3))
+    cards = []
+    for k, (category, confidence) in enumerate(found):
+        palette, alpha = _palette(colour_of(category))
+        image = _uri(png(np.full((1, 1 + k), 11, np.uint8), palette, alpha))
+        pictures = TrackPictures(None, (SurfaceDrawing("", image, "", ""),), (1.0, 1.0, 1.0))
+        row = TrackRow(k, k, category, confidence, "", "/d", {})
+        cards.append(Card(row, line, None if k in missing else pictures))
+    images = [base64.b64decode(face.partition(",")[2]) for face in _faces(cards, labels)]
+    decoded = [np.array(Image.open(io.BytesIO(image)).convert("RGB")) for image in images]
+    return [(image.shape[1] - 1, tuple(image[0, 0].tolist())) for image in decoded]
+
+
 def test_thumbnails_are_most_confident_of_each_category() -> None:
     """The most confident of the others follow, up to six."""
     found = [("cup", 0.6), ("can", 0.7), ("cup", 0.95), ("cup", 0.9), ("unknown", 0.3)]
     found += [("can", 0.8), ("cup", 0.5), ("cup", 0.4)]
-    line = Timeline(np.zeros(0), np.zeros(0, bool), np.zeros((0, 3)), (), np.zeros(3))
-    cards = []
-    for k, (category, confidence) in enumerate(found):
-        pictures = TrackPictures(None, (SurfaceDrawing("", str(k), "", ""),), (1.0, 1.0, 1.0))
-        cards.append(Card(TrackRow(k, k, category, confidence, "", "/d", {}), line, pictures))
+    labels = {k: TrackLabel(k, *track) for k, track in enumerate(found)}
 
-    assert _faces(cards) == ("2", "5", "4", "3", "1", "0")
-    cards[2] = replace(cards[2], pictures=None)
-    assert _faces(cards) == ("3", "5", "4", "1", "0", "6")
+    assert [k for k, _ in thumbnails(found, labels)] == [2, 5, 4, 3, 1, 0]
+    assert [k for k, _ in thumbnails(found, labels, [2])] == [3, 5, 4, 1, 0, 6]
+
+
+def test_thumbnails_show_what_labels_say() -> None:
+    """They showed deleted and merged tracks, and renamed ones in the colour of the old category."""
+    found = [("cup", 0.99), ("can", 0.6), ("can", 0.9), ("box", 0.5), ("can", 0.8)]
+    ball = TrackLabel(3, "ball", 1.0)
+    labels = {1: TrackLabel(1, "can", 0.6), 2: ball, 3: ball, 4: TrackLabel(4, "can", 0.8)}
+    shown = thumbnails(found, labels)
+
+    assert [k for k, _ in shown] == [3, 4, 1]
+    assert [colour for _, colour in shown[:2]] == [
+        tuple(_palette(colour_of(name))[0][11]) for name in ("ball", "can")
+    ]
+    assert [k for k, _ in thumbnails(found, labels, [3])] == [2, 4, 1]  # a picture of a part
 
 
 def test_strip_boxes_scale_with_their_images() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from shapecat.arrays import U1, U2
 
-__all__ = ["png"]
+__all__ = ["png", "with_palette"]
 
 _COLOUR_TYPES = {"grey": 0, "palette": 3}
 
@@ -44,7 +44,15 @@ def png(
     strategy = zlib.Z_RLE if level == 1 else zlib.Z_DEFAULT_STRATEGY
     packer = zlib.compressobj(level, strategy=strategy)
     parts += [(b"IDAT", packer.compress(pixels.tobytes()) + packer.flush()), (b"IEND", b"")]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
-        for name, body in parts
-    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(name, body) for name, body in parts)
+
+
+def with_palette(image: bytes, palette: U1) -> bytes:
+    """Replace the palette of an image that `png` encoded by one of the same size (k, 3)."""
+    chunk = _chunk(b"PLTE", np.ascontiguousarray(palette, np.uint8).tobytes())
+    start = image.index(b"PLTE") - 4  # after the length of the chunk
+    return image[:start] + chunk + image[start + len(chunk) :]
+
+
+def _chunk(name: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))

@@ -49,7 +49,7 @@ function take(other) {
 function fits(card) {
   const label = labelOf(card.dataset.track);
   const state = byId("state").value;
-  if (hiddenCategories.has(card.dataset.category)) return false;
+  if (hiddenCategories.has(categoryOf(card.dataset.track))) return false;
   if (Number(card.dataset.confidence) * 100 > Number(byId("confidence").value)) return false;
   if (state === "open") return label === "";
   if (state === "checked") return label !== "";
@@ -63,7 +63,7 @@ function filter() {
     card.hidden = !fits(card);
     count += card.hidden ? 0 : 1;
   }
-  byId("shown").textContent = `${count} of ${cards.length} ${cards.length === 1 ? "track" : "tracks"}`;
+  byId("shown").textContent = `${count} of ${cards.length} ${cards.length === 1 ? "card" : "cards"}`;
   byId("empty").hidden = count > 0;
   // Keys act on the current card, which must not be hidden.
   if (!current || current.hidden) makeCurrent([...gallery.children].find((card) => !card.hidden));
@@ -73,8 +73,41 @@ function order() {
   const how = byId("order").value;
   const sorted = [...cards];
   if (how === "time") sorted.sort((a, b) => a.dataset.first - b.dataset.first);
-  if (how === "category") sorted.sort((a, b) => a.dataset.category.localeCompare(b.dataset.category));
+  if (how === "category") {
+    sorted.sort((a, b) => categoryOf(a.dataset.track).localeCompare(categoryOf(b.dataset.track)));
+  }
   gallery.append(...sorted);
+}
+
+// Count the tracks as count_cards in cards.py does: merged ones once, deleted ones not.
+function recount() {
+  const tracks = cards.map((card) => card.dataset.track);
+  const unsure = (card) => card.dataset.category === "unknown" || Number(card.dataset.confidence) < 0.8;
+  const objects = [...new Set(tracks.map(shownTrack))].filter((track) => labelOf(track) !== "delete");
+  const counts = new Map([...byId("categories").children].map((chip) => [chip.dataset.category, 0]));
+  for (const name of objects.map(categoryOf)) counts.set(name, (counts.get(name) || 0) + 1);
+  for (const [name, count] of counts) chipOf(name).querySelector("b").textContent = count;
+  showTile("tracks", objects.length);
+  showTile("uncertain", cards.filter((card) => labels.get(card.dataset.track) === "" && unsure(card)).length);
+}
+
+// Return the filter of a category; make one for a new category.
+function chipOf(name) {
+  const chips = byId("categories");
+  const found = [...chips.children].find((chip) => chip.dataset.category === name);
+  if (found) return found;
+  const made = chips.children[0].cloneNode(true);
+  made.dataset.category = name;
+  made.setAttribute("aria-pressed", "true");
+  made.style.setProperty("--c", data.colours[name] || "#fff");
+  made.replaceChildren(made.querySelector(".dot"), name, " ", made.querySelector("b"));
+  chips.append(made);
+  return made;
+}
+
+function showTile(name, value) {
+  const title = [...document.querySelectorAll(".tiles dt")].find((one) => one.textContent === name);
+  title.nextElementSibling.textContent = value;
 }
 
 function element(name, text, className) {
@@ -97,6 +130,7 @@ function summarize() {
     ? `${right} of ${checked.length} checked ${checked.length === 1 ? "track was" : "tracks were"} right. Rows: detected category; columns: your label.`
     : "To confirm or correct a track, press a digit, or click a category on its card.";
   byId("confusion").replaceChildren(...(checked.length ? [confusion(checked)] : []));
+  recount();
 }
 
 function confusion(checked) {

@@ -1,11 +1,13 @@
 """HTML for the card of a track and for a frame of the strip."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from html import escape
 from importlib.resources import files
 from string import Template
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,10 +18,11 @@ from shapecat.outputs.report.pictures import StripFrame, TrackPictures
 from shapecat.outputs.report.surfaces import SIDE, SurfaceDrawing
 from shapecat.outputs.report.tracks import Timeline
 from shapecat.outputs.wording import confidence_text, time_span
+from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.labels.track_table import TrackRow
 from shapecat.types import UNKNOWN
 
-__all__ = ["Card", "asset", "card_html", "frame_html", "is_unsure", "template"]
+__all__ = ["Card", "Tally", "asset", "card_html", "count_cards", "frame_html", "template"]
 
 _LINES = 3  # categories in a timeline
 _MOST_STEPS = 80
@@ -47,7 +50,29 @@ def template(name: str) -> Template:
     return Template(asset(name))
 
 
-def is_unsure(row: TrackRow) -> bool:
+class Tally(NamedTuple):
+    """Counts of the tracks of a run, as their labels say; `cards.js` counts in the same way.
+
+    ``categories`` counts tracks, where merged tracks count as one. ``unsure`` is the number of
+    uncertain tracks without a label, ``checked`` that of tracks with a label, both before merging.
+    """
+
+    categories: Counter[str]
+    unsure: int
+    checked: int
+
+
+def count_cards(cards: Sequence[Card], labels: Mapping[int, TrackLabel]) -> Tally:
+    """Count the tracks of the cards; ``labels`` are their final labels."""
+    objects = {labels[card.row.track] for card in cards if card.row.track in labels}
+    return Tally(
+        Counter(label.category for label in objects),
+        unsure=sum(card.row.label == "" and _is_unsure(card.row) for card in cards),
+        checked=sum(card.row.label != "" for card in cards),
+    )
+
+
+def _is_unsure(row: TrackRow) -> bool:
     """Return whether a track should be checked first: its category is unknown or uncertain."""
     return row.category == UNKNOWN or row.confidence < 0.8
 

@@ -13,6 +13,23 @@ function known(label) {
 // Return the label of a track in its usual spelling, and without `new`: `pan` for `new pan`.
 function labelOf(track) { return known(labels.get(track).replace(NEW, "$1")); }
 
+// Return the track as which a track is shown: itself, or the one at the end of its merges.
+function shownTrack(track) {
+  let end = track;
+  for (const _ of data.rows) {  // a table from elsewhere may hold a loop
+    const merge = labels.get(end).match(MERGE);
+    if (!merge || !labels.has(merge[1])) break;
+    end = merge[1];
+  }
+  return end;
+}
+
+// Return the category that a track has with its label; a deleted track keeps its own.
+function categoryOf(track) {
+  const end = shownTrack(track), label = labelOf(end);
+  return label && label !== "delete" ? label : data.rows.find((row) => row.track === end).category;
+}
+
 function say(text, bad = false) {
   byId("said").textContent = text;
   byId("said").classList.toggle("bad", bad);

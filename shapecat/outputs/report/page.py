@@ -17,10 +17,11 @@ from shapecat.outputs.colours import hex_colour
 from shapecat.outputs.counts import by_count, count_words, plural, size_words
 from shapecat.outputs.report.cards import (
     Card,
+    Tally,
     asset,
     card_html,
+    count_cards,
     frame_html,
-    is_unsure,
     template,
 )
 from shapecat.outputs.report.pictures import StripFrame
@@ -36,19 +37,12 @@ _SCRIPTS = ("labels.js", "meaning.js", "saving.js", "cards.js", "frames.js", "ke
 
 @dataclass(frozen=True)
 class Listed:
-    """A run in the index.
-
-    ``categories`` counts tracks, where merged tracks count as one. ``unsure`` is the number of
-    uncertain tracks without a label, ``checked`` that of tracks with a label, both before merging.
-    ``faces`` are pictures of some tracks as data URIs.
-    """
+    """A run in the index; ``faces`` are pictures of some of its tracks as data URIs."""
 
     link: str
     name: str
     info: Mapping[str, Any]
-    categories: Counter[str]
-    unsure: int
-    checked: int
+    tally: Tally
     faces: tuple[str, ...]
 
 
@@ -79,10 +73,12 @@ def run_page(
     served : whether corrections are sent to a server; if not, the page offers a table to download.
     """
     run = finished.info
-    counts = Counter(card.row.category for card in cards)
+    tally = count_cards(cards, finished.labels)
     names = (UNKNOWN, *finished.categories)
     end = max((float(c.timeline.seconds[-1]) for c in cards if len(c.timeline.seconds)), default=0)
-    ordered = [name for name in names if name in counts] + sorted(counts.keys() - set(names))
+    deleted = {card.row.category for card in cards if card.row.track not in finished.labels}
+    filters = tally.categories.keys() | deleted  # a deleted track keeps its filter
+    ordered = [name for name in names if name in filters] + sorted(filters - set(names))
     connect = "'self'" if served else "'none'"
     return template("page.html").substitute(
         title=escape(finished.name),
@@ -95,13 +91,13 @@ def run_page(
                 "frames": run["counts"]["frames"],
                 "length": f"{length_s:.1f} s",
                 "detections": run["counts"]["detections"],
-                "tracks": len(cards),
-                "uncertain": sum(is_unsure(card.row) for card in cards),
+                "tracks": tally.categories.total(),
+                "uncertain": tally.unsure,
             }
         ),
         warnings=_warnings([*run["warnings"], *notes]),
         strip=_strip(frames, cards),
-        chips="".join(_chip(name, counts[name]) for name in ordered),
+        chips="".join(_chip(name, tally.categories[name]) for name in ordered),
         cards="".join(card_html(card, run["model"]["categories"], names, end) for card in cards),
         empty="No track fits this filter." if cards else "No objects were found.",
         next=_next_step(finished, served=served),
@@ -115,13 +111,13 @@ def run_page(
 
 def index_page(title: str, runs: Sequence[Listed], notes: Sequence[str] = ()) -> str:
     """Return the page that lists several runs, with warnings above them."""
-    total = sum((item.categories for item in runs), Counter[str]())
+    total = sum((item.tally.categories for item in runs), Counter[str]())
     tiles = {
         "recordings": len(runs),
         "frames": sum(int(item.info["counts"]["frames"]) for item in runs),
         "tracks": total.total(),
-        "uncertain": sum(item.unsure for item in runs),
-        "checked": sum(item.checked for item in runs),
+        "uncertain": sum(item.tally.unsure for item in runs),
+        "checked": sum(item.tally.checked for item in runs),
     }
     return template("index.html").substitute(
         head=_head(title),
@@ -271,13 +267,13 @@ def _key(run: Mapping[str, Any], table: TrackTable) -> str:
 def _listed(item: Listed) -> str:
     share = "".join(
         f'<span style="--c:{hex_colour(name)};--n:{count}" title="{escape(name)} {count}"></span>'
-        for name, count in by_count(item.categories)
+        for name, count in by_count(item.tally.categories)
     )
-    words = count_words(item.categories, "no tracks")
+    words = count_words(item.tally.categories, "no tracks")
     seconds = item.info["seconds"].get("total", 0.0)
     notes = [plural(item.info["counts"]["frames"], "frame"), f"processed in {seconds:.1f} s"]
-    notes += [f"{item.unsure} uncertain"] if item.unsure else []
-    notes += [f"{item.checked} checked"] if item.checked else []
+    notes += [f"{item.tally.unsure} uncertain"] if item.tally.unsure else []
+    notes += [f"{item.tally.checked} checked"] if item.tally.checked else []
     faces = "".join(f'<img alt="" src="{face}">' for face in item.faces)
     warnings = len(item.info["warnings"])
     warn = f' · <span class="warn">⚠ {plural(warnings, "warning")}</span>' if warnings else ""

@@ -7,11 +7,11 @@ import numpy as np
 from scipy import ndimage
 
 from shapecat.arrays import F4, F8, U1, U2, Bool, Record, array
-from shapecat.outputs.png import png
+from shapecat.outputs.png import png, with_palette
 from shapecat.surface.triangles import triangles_of
 from shapecat.types import NeuralGas
 
-__all__ = ["MOST_POINTS", "SIDE", "Snapshot", "SurfaceDrawing", "draw"]
+__all__ = ["MOST_POINTS", "SIDE", "Snapshot", "SurfaceDrawing", "draw", "recoloured"]
 
 SIDE = 160
 """Width and height of a picture in pixels."""
@@ -71,17 +71,25 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[SurfaceDrawing, 
         scale = 0.46 * SIDE / radius
         spots = _project(points - middle, view, scale)
         image = png(_shade(spots), palette, alpha)
-        encoded = base64.b64encode(image).decode("ascii")
         nodes = np.round(_project(shot.gas.neurons - middle, view, scale)[:, :2]).astype(int)
         pictures.append(
             SurfaceDrawing(
                 title,
-                f"data:image/png;base64,{encoded}",
+                _uri(image),
                 "".join(f"M{a} {b}L{c} {d}" for (a, b), (c, d) in nodes[shot.gas.edges].tolist()),
                 "".join(f"M{a} {b}h0" for a, b in nodes.tolist()),
             )
         )
     return tuple(pictures)
+
+
+def recoloured(picture: str, colour: tuple[int, int, int]) -> str:
+    """Return a picture of `draw` in another colour."""
+    return _uri(with_palette(base64.b64decode(picture.partition(",")[2]), _palette(colour)[0]))
+
+
+def _uri(image: bytes) -> str:
+    return f"data:image/png;base64,{base64.b64encode(image).decode('ascii')}"
 
 
 def _graph_points(gas: NeuralGas) -> F4:

@@ -13,16 +13,19 @@ from urllib.parse import quote, unquote
 
 from shapecat.arrays import F8
 from shapecat.errors import OutputError, explained, listed
+from shapecat.outputs.colours import colour_of
 from shapecat.outputs.counts import plural
-from shapecat.outputs.report.cards import Card, is_unsure
+from shapecat.outputs.report.cards import Card, count_cards
 from shapecat.outputs.report.choosing import choose_frames
 from shapecat.outputs.report.page import Listed, index_page, run_page
 from shapecat.outputs.report.pictures import Pictures, take_pictures
+from shapecat.outputs.report.surfaces import recoloured
 from shapecat.outputs.report.tracks import Timeline, read_length, read_stage_seconds, read_timelines
 from shapecat.runs.finished import find_runs, read_finished
 from shapecat.runs.folder import require_work
 from shapecat.runs.labels.corrections import read_original_table
 from shapecat.runs.labels.far_merges import Gap, read_gaps
+from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.labels.track_table import TrackTable
 from shapecat.system.files import replacing
 from shapecat.system.progress import Observer, ignore
@@ -96,15 +99,12 @@ class RunReport:
         OutputError : the tracks.csv of the run is invalid.
         """
         finished, cards = read_finished(self.folder), self._cards(self._table)
-        objects = set(finished.labels.values())  # merged tracks have the same label
         return Listed(
             link=link,
             name=finished.name,
             info=finished.info,
-            categories=Counter(label.category for label in objects),
-            unsure=sum(card.row.label == "" and is_unsure(card.row) for card in cards),
-            checked=sum(card.row.label != "" for card in cards),
-            faces=_faces(cards),
+            tally=count_cards(cards, finished.labels),
+            faces=_faces(cards, finished.labels),
         )
 
     @property
@@ -272,12 +272,20 @@ def _link(start: Path, target: Path) -> str:
     return quote(Path(os.path.relpath(target, start)).as_posix())
 
 
-def _faces(cards: Sequence[Card]) -> tuple[str, ...]:
-    """Return pictures of the most certain track of each category, then of other tracks."""
-    drawn = [(card.row, card.pictures.surfaces[0].image) for card in cards if card.pictures]
+def _faces(cards: Sequence[Card], labels: Mapping[int, TrackLabel]) -> tuple[str, ...]:
+    """Return pictures of the most certain object of each category, then of other objects.
+
+    ``labels`` are the final labels. Of merged tracks, the one that gives the number is preferred.
+    """
+    pictures: dict[TrackLabel, str] = {}
+    shown = [card for card in cards if card.pictures and card.row.track in labels]
+    for card in sorted(shown, key=lambda card: card.row.track != labels[card.row.track].track):
+        if card.pictures:
+            pictures.setdefault(labels[card.row.track], card.pictures.surfaces[0].image)
     first: dict[str, str] = {}
     repeated = []
-    for row, image in sorted(drawn, key=lambda face: -face[0].confidence):
-        if first.setdefault(row.category, image) is not image:
+    for label, drawn in sorted(pictures.items(), key=lambda face: -face[0].confidence):
+        image = recoloured(drawn, colour_of(label.category))
+        if first.setdefault(label.category, image) is not image:
             repeated.append(image)
     return (*first.values(), *repeated)[:_FACES]
