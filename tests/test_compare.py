@@ -1058,6 +1058,26 @@ def test_detection_without_track_keeps_its_place(run: Path) -> None:
     assert [(item.track, item.category) for item in first.items] == [(None, "cup"), (2, "can")]
 
 
+def test_detection_without_track_is_compared_by_its_full_box(
+    shapecat: Run, run: Path, truth: Path
+) -> None:
+    """It was compared by the box of its visible part, which is smaller than the true one."""
+    path = run / "tracks.parquet"
+    pq.write_table(pq.read_table(path).slice(1), path)  # of the first frame's cup
+    path = run / "detections.parquet"
+    rows = pq.read_table(path).to_pylist()
+    full = {"center": [0.0, 0.05, 1.0], "size": [0.2, 0.3, 0.4], "orientation": [0, 0, 0, 1]}
+    rows[0] |= {f"{name}_full": value for name, value in full.items()}
+    pq.write_table(pa.Table.from_pylist(rows, DETECTIONS), path)
+    content = json.loads(truth.read_text())
+    true_box = full | {"size": [0.2, 0.3, 0.2]}  # half as high as the estimate
+    content[0]["objects"][0]["box"] = true_box
+    truth.write_text(json.dumps(content))
+    found = json.loads(shapecat("compare", run, truth, "--json").stdout)
+
+    assert found["box_iou"] == {"n": 1, "mean": pytest.approx(0.5, abs=1e-4)}
+
+
 def test_track_of_missing_detection_is_refused(run: Path) -> None:
     """Its object would count as missed."""
     path = run / "detections.parquet"

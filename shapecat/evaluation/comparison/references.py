@@ -33,6 +33,7 @@ from shapecat.runs.tables.reading import (
     read_stamps,
     read_together,
 )
+from shapecat.runs.tables.schemas import FULL_BOX
 from shapecat.types import Box
 
 __all__ = [
@@ -247,7 +248,7 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
     folder = finished.folder
     deleted = _deleted(folder, finished.labels)
     names = ("topic", "frame", "detection", "center", "size", "orientation", "indices")
-    columns = [*names, "posterior", "category", "confidence"]
+    columns = [*names, *FULL_BOX, "posterior", "category", "confidence"]
     tracks = LabelledTracks.read(folder, finished.labels)
     tables = {"frames": ["topic", "frame", "stamp_ns", "up"], "detections": columns}
     for frames, detections in read_together(folder, tables):
@@ -265,7 +266,8 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
             for number, r in remaining.items():
                 if (*key, number) not in deleted:
                     untracked = (None, r["category"], r["confidence"])
-                    items[number] = _item(untracked, [r], [None], row["up"])
+                    whole = None if r[FULL_BOX[0]] is None else Box(*(r[n] for n in FULL_BOX))
+                    items[number] = _item(untracked, [r], [whole], row["up"])
             yield key, row, Labelling(tuple(items[number] for number in sorted(items)))
 
 
