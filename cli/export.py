@@ -7,6 +7,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
+from shapecat.errors import common_exit_code
 from shapecat.outputs.counts import plural
 
 from .options import ANY_PATH, boxes_option, recording_option
@@ -99,42 +100,64 @@ def export(
     shapecat export results --format kitti --out kitti
     shapecat export results --format coco --out coco --min-confidence 0.8
     """
-    from shapecat.outputs.exports.formats import common_categories, export_run
-    from shapecat.runs.finished import find_runs, require_recordings
+    from shapecat.runs.finished import find_runs
 
-    runs = find_runs(folders)
-    if recording is not None and len(runs) > 1:
-        msg = f"--recording is for a single run, not for {len(runs)}"
+    given = [name for name in chosen if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
+    if given and kind not in _DATASETS:
+        msg = f"--{given[0].replace('_', '-')} is for --format coco and yolo, not {kind}"
         raise click.UsageError(msg)
-    if len(runs) > 1:
-        require_recordings(runs)
+    if boxes is not None and kind not in _BOX_FORMATS:
+        msg = f"--boxes is for --format {' and '.join(_BOX_FORMATS)}, not {kind}"
+        raise click.UsageError(msg)
+    found = find_runs(folders)
+    if recording is not None and len(found) > 1:
+        msg = f"--recording is for a single run, not for {len(found)}"
+        raise click.UsageError(msg)
+    needs_colour = kind in _DATASETS and not chosen["depth"]
+    runs, failed = _usable(found, needs_colour=needs_colour) if len(found) > 1 else (found, False)
     if kind in {*_DATASETS, "crops"}:
         _require_distinct_frames(runs)
     else:
         _require_distinct_names(runs)
-    if boxes is not None and kind not in _BOX_FORMATS:
-        msg = f"--boxes is for --format {' and '.join(_BOX_FORMATS)}, not {kind}"
-        raise click.UsageError(msg)
     if kind in _DATASETS:
         _export_dataset(runs, kind, out, recording, {"every": every, **chosen})
-        return
-    given = [name for name in chosen if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
-    if given:
-        msg = f"--{given[0].replace('_', '-')} is for --format coco and yolo, not {kind}"
-        raise click.UsageError(msg)
+    else:
+        visible = boxes == "visible"
+        _export_runs(runs, kind, out, every=every, visible_boxes=visible, recording=recording)
+    if len(runs) < len(found):
+        click.echo(f"skipped {len(found) - len(runs):,} of {plural(len(found), 'run')}", err=True)
+    ctx.exit(1 if failed else 0)
+
+
+def _usable(folders: Sequence[Path], *, needs_colour: bool) -> tuple[list[Path], bool]:
+    """Return the runs that can be exported, and whether others have errors.
+
+    Print to stderr why runs are skipped; end the command if none is left.
+    """
+    from shapecat.runs.finished import find_usable
+
+    found, errors = find_usable(folders)
+    for error in errors:
+        click.echo(f"Error: {error}", err=True)
+    gray = [run.folder for run in found if needs_colour and not run.info["color"]]
+    for folder in gray:
+        click.echo(f"{folder}: skipped: no colour images (--depth exports depth images)", err=True)
+    runs = [run.folder for run in found if run.folder not in gray]
+    if not runs:
+        click.echo("Error: no run is left to export", err=True)
+        codes = {error.exit_code for error in errors}
+        raise click.exceptions.Exit(common_exit_code(codes | {1} if gray else codes))
+    return runs, bool(errors)
+
+
+def _export_runs(runs: Sequence[Path], kind: str, out: Path, **options: Any) -> None:
+    """Export runs one by one."""
+    from shapecat.outputs.exports.formats import common_categories, export_run
+
     categories = common_categories(runs)
     for run in runs:
         with progress_bars() as bars:
-            count = export_run(
-                run,
-                kind,
-                out,
-                every=every,
-                visible_boxes=boxes == "visible",
-                categories=categories,
-                recording=recording,
-                observe=bars,
-            )
+            count = export_run(run, kind, out, categories=categories, observe=bars, **options)
         with for_any_reader():
             click.echo(f"{run}: {plural(count, 'labelled view')} in {out}")
 

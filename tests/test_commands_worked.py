@@ -502,7 +502,7 @@ def test_options_are_passed_on_and_results_printed(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(target, stub)
     monkeypatch.setattr("shapecat.runs.finished.find_runs", list)
-    monkeypatch.setattr("shapecat.runs.finished.require_recordings", list)
+    monkeypatch.setattr("shapecat.cli.export._usable", lambda runs, **_: (runs, False))
     monkeypatch.setattr("shapecat.cli.export._require_distinct_frames", list)
     common = "shapecat.outputs.exports.formats.common_categories"
     monkeypatch.setattr(common, lambda runs: [f"of {run}" for run in runs])

@@ -128,7 +128,7 @@ def test_crops_are_upright_at_height_zero_with_viewpoint(run: Path, tmp_path: Pa
     [
         ("crops", "lab", "hold the same frames of a recording; export only one"),
         ("crops", "lab2", "hold the same frames of a recording; export only one"),
-        ("coco", "lab2", "hold the same frames of a recording; export only one"),
+        ("coco --depth", "lab2", "hold the same frames of a recording; export only one"),
         ("kitti", "lab", "have the same name; export them to different folders"),
     ],
 )
@@ -139,7 +139,7 @@ def test_exports_of_two_runs_do_not_collide(
     folders = [tmp_path / "left" / "lab", tmp_path / "right" / second]
     for folder in folders:
         shutil.copytree(run, folder)
-    result = shapecat("export", *folders, "--format", form, "--out", tmp_path / "out")
+    result = shapecat("export", *folders, "--format", *form.split(), "--out", tmp_path / "out")
 
     assert result.exit_code != 0
     assert problem in result.output
@@ -428,24 +428,53 @@ def test_missing_or_changed_recording_is_refused(run: Path, tmp_path: Path) -> N
     assert not (tmp_path / "crops").exists()
 
 
-def test_all_missing_recordings_are_named_before_export(
-    shapecat: Run, run: Path, tmp_path: Path
-) -> None:
-    """An export of many runs ended after hours at the first recording that had been moved."""
-    for name in ("a", "b", "c"):
-        shutil.copytree(run, tmp_path / "results" / name)
-    for name in ("b", "c"):
-        place = tmp_path / "results" / name / "run.json"
+def several_runs(run: Path, results: Path) -> None:
+    """Copy a run as a to d; the recordings of b and c are missing, and a label of d is invalid."""
+    for name in "abcd":
+        shutil.copytree(run, results / name)
+        place = results / name / "run.json"
         info = json.loads(place.read_text())
-        info["input"]["path"] = f"/moved/{name}.mcap"
+        info["input"] |= {"digest": f"xxh3-128:{name}"}
+        info["input"] |= {"path": f"/moved/{name}.mcap"} if name in "bc" else {}
         place.write_text(json.dumps(info))
-    out = tmp_path / "out"
-    result = shapecat("export", tmp_path / "results", "--format", "kitti", "--out", out)
+    table = results / "d" / "tracks.csv"
+    header, first, *rest = table.read_text().splitlines()
+    cells = first.split(",")
+    cells[header.split(",").index("label")] = "merge 7"
+    table.write_text("\n".join([header, ",".join(cells), *rest]) + "\n")
 
-    assert result.exit_code == 3
-    assert "/moved/b.mcap of" in result.stderr
-    assert "/moved/c.mcap of" in result.stderr
-    assert not out.exists()
+
+@pytest.mark.parametrize("kind", ["kitti", "crops"])
+def test_runs_with_errors_are_named_and_skipped(
+    shapecat: Run, run: Path, tmp_path: Path, kind: str
+) -> None:
+    """An export of many runs exported none if the recording of one had been moved."""
+    results, out = tmp_path / "results", tmp_path / "out"
+    several_runs(run, results)
+    result = shapecat("export", results, "--format", kind, "--out", out, "--every", 6)
+
+    assert result.exit_code == 1
+    for name in "bc":
+        advice = f"`shapecat annotate {results / name} --recording PATH`"
+        assert f"/moved/{name}.mcap: the recording is missing; if it was moved" in result.stderr
+        assert advice in result.stderr
+    assert f"Error: {results / 'd' / 'tracks.csv'}: the table cannot be used" in result.stderr
+    assert result.stderr.endswith("skipped 3 of 4 runs\n")
+    assert result.stdout.startswith(f"{results / 'a'}: ")
+    assert result.stdout.count("labelled view") == 1
+    assert out.exists()
+
+
+def test_export_without_usable_run_fails(shapecat: Run, run: Path, tmp_path: Path) -> None:
+    """It has the exit code that all of its runs share."""
+    results, out = tmp_path / "results", tmp_path / "out"
+    several_runs(run, results)
+    for names, code in (("bc", 3), ("bd", 1)):
+        runs = [results / name for name in names]
+        result = shapecat("export", *runs, "--format", "kitti", "--out", out)
+        assert (result.exit_code, result.stdout) == (code, "")
+        assert result.stderr.endswith("Error: no run is left to export\n")
+        assert not out.exists()
 
 
 def test_export_command_reports_views_and_errors(shapecat: Run, run: Path, tmp_path: Path) -> None:

@@ -260,22 +260,36 @@ def test_depth_images_are_millimetres_with_their_own_masks(run: Path, tmp_path: 
     assert {o.category for objects in left.values() for o in objects.values()} <= {"unknown"}
 
 
-def test_all_runs_without_colour_are_named_before_export(
-    run: Path, guessed_run: Path, tmp_path: Path, shapecat: Run, monkeypatch: pytest.MonkeyPatch
+def test_runs_without_colour_are_named_and_skipped(
+    run: Path, guessed_run: Path, tmp_path: Path, shapecat: Run
 ) -> None:
-    """An export of many runs ended after hours at the first recording without colour."""
-    monkeypatch.delattr("shapecat.outputs.exports.formats.images_of")
-    other = tmp_path / "other"
-    shutil.copytree(guessed_run, other)
-    info = json.loads((other / "run.json").read_text())
-    info["input"]["digest"] = "xxh3-128:another"
-    (other / "run.json").write_text(json.dumps(info))
-    words = ("export", run, guessed_run, other, "--format", "coco", "--out", tmp_path / "out")
-    result = shapecat(*words)
-    assert result.exit_code == 1
-    problem = "no colour images; leave them out, or export depth images (--depth)"
-    assert f"Error: {guessed_run}, {other}: {problem}\n" in result.stderr
-    assert not (tmp_path / "out").exists()
+    """A data set of a folder of runs had no image at all if one of them had no colour."""
+    for name, source in (("a", guessed_run), ("b", run), ("c", guessed_run)):
+        shutil.copytree(source, tmp_path / "results" / name)
+        place = tmp_path / "results" / name / "run.json"
+        info = json.loads(place.read_text())
+        info["input"]["digest"] = f"xxh3-128:{name}"
+        place.write_text(json.dumps(info))
+    out, results = tmp_path / "out", tmp_path / "results"
+    result = shapecat("export", results, "--format", "coco", "--out", out)
+
+    assert result.exit_code == 0
+    hint = "no colour images (--depth exports depth images)"
+    lines = [f"{results / name}: skipped: {hint}\n" for name in "ac"]
+    assert result.stderr == "".join([*lines, "skipped 2 of 3 runs\n"])
+    assert result.stdout.startswith("1 run: ")
+    images = read_coco(out)["images"]
+    assert {image["recording"] for image in images} == {"b"}
+    assert len(images) > 1
+
+    depth = shapecat("export", results, "--format", "coco", "--out", tmp_path / "d", "--depth")
+    assert (depth.exit_code, depth.stderr) == (0, "")
+    none = shapecat("export", results / "a", results / "c", "--format", "yolo", "--out", out / "n")
+    assert (none.exit_code, none.stdout) == (1, "")
+    assert none.stderr == "".join([*lines, "Error: no run is left to export\n"])
+    alone = shapecat("export", results / "a", "--format", "yolo", "--out", out / "n")
+    assert (alone.exit_code, alone.stderr) == (1, f"Error: {results / 'a'}: {hint}\n")
+    assert not (out / "n").exists()
 
 
 @pytest.mark.parametrize(

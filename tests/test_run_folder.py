@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import socket
 from contextlib import nullcontext
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 from shapecat.errors import OutputError, RecordingError
 from shapecat.recordings.files import input_files
-from shapecat.runs.finished import open_source, require_recordings
+from shapecat.runs.finished import find_usable, open_source
 from shapecat.runs.folder import (
     RUN_FILES,
     clear,
@@ -297,8 +298,12 @@ def test_recording_at_url_is_missing_under_its_url(tmp_path: Path) -> None:
         open_source(read_run(tmp_path)),
     ):
         pytest.fail("it is not on this machine")
-    with pytest.raises(RecordingError, match=rf"annotate RUN --recording PATH`:\n  {url} of "):
-        require_recordings([tmp_path])
+    (tmp_path / "tracks.csv").write_text("track,category,confidence,label\n")
+    shutil.copy(tmp_path / "tracks.csv", tmp_path / "tracks.original.csv")
+    found, (error,) = find_usable([tmp_path])
+    assert found == []
+    assert f"{url}: the recording is at a URL" in str(error)
+    assert f"`shapecat annotate {tmp_path} --recording PATH`" in str(error)
 
 
 @pytest.mark.parametrize("length", [249, 253, 300])

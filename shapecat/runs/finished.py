@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from shapecat.errors import OutputError, RecordingError
+from shapecat.errors import OutputError, RecordingError, ShapecatError
 from shapecat.recordings import Recording, open_recording
 from shapecat.runs.folder import read_run
 from shapecat.runs.identity import content_digest, same_content
@@ -16,7 +16,7 @@ from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import require_utf8
 from shapecat.types import LabelledFrame
 
-__all__ = ["FinishedRun", "find_runs", "open_source", "read_finished", "require_recordings"]
+__all__ = ["FinishedRun", "find_runs", "find_usable", "open_source", "read_finished"]
 
 
 @dataclass(frozen=True)
@@ -96,20 +96,23 @@ def _runs_in(folder: Path) -> list[Path]:
     return runs
 
 
-def require_recordings(folders: Iterable[Path]) -> None:
-    """Check that the recordings of several runs are where they were processed.
+def find_usable(folders: Iterable[Path]) -> tuple[list[FinishedRun], list[ShapecatError]]:
+    """Read the runs whose labels are valid and whose recordings are unchanged.
 
-    Raises
-    ------
-    RecordingError : some are missing; the message lists all of them.
+    Returns
+    -------
+    These runs, and the error of each other run.
     """
-    sources = {folder: read_run(folder)["input"]["path"] for folder in folders}
-    missing = [f"{path} of {run}" for run, path in sources.items() if not Path(path).exists()]
-    if missing:
-        listed = "\n  ".join(missing)
-        hint = "store where each is, with `shapecat annotate RUN --recording PATH`"
-        msg = f"missing recordings; {hint}:\n  {listed}"
-        raise RecordingError(msg)
+    usable, errors = [], []
+    for folder in folders:
+        advice = f"store its new path with `shapecat annotate {folder} --recording PATH`"
+        try:
+            finished = read_finished(folder)
+            with open_source(finished.info, advice=advice):
+                usable.append(finished)
+        except ShapecatError as error:
+            errors.append(error)
+    return usable, errors
 
 
 @contextmanager

@@ -174,8 +174,7 @@ def export_dataset(
         nonlocal uncertain
         gray = [str(run.folder) for run in runs if not (selection.depth or run.info["color"])]
         if gray:
-            hint = "leave them out, or export depth images (--depth)"
-            msg = f"{', '.join(gray)}: no colour images; {hint}"
+            msg = f"{', '.join(gray)}: no colour images (--depth exports depth images)"
             raise OutputError(msg)
         splits = split_runs(runs, selection.val)
         for split, stems, run in zip(splits, image_stems(runs), runs, strict=True):
