@@ -199,6 +199,7 @@ def test_surfaces_are_drawn_from_meshes_without_recording(run: Path) -> None:
     assert 'class="crop"' not in text
     assert 'id="strip"' not in text
     assert report.listed("x").faces
+    assert report.listed("x").warnings == text.count("<li>⚠") == len(info["warnings"]) + 1
 
 
 @pytest.mark.usefixtures("without_pictures")

@@ -282,10 +282,9 @@ def test_index_sums_its_runs() -> None:
     listed = []
     for k, (frames, unsure, checked) in enumerate([(7, 2, 5), (40, 1, 0)]):
         counts = Counter({"cup": 3 + k, "can": 6})
-        info = {"counts": {"frames": frames}, "seconds": {"total": 12.34}, "warnings": ["x"] * k}
-        listed.append(
-            Listed(f"{k}.html", f"run {k}", info, Tally(counts, unsure, checked), ("data:p",))
-        )
+        info = {"counts": {"frames": frames}, "seconds": {"total": 12.34}}
+        tally = Tally(counts, unsure, checked)
+        listed.append(Listed(f"{k}.html", f"run {k}", info, tally, k, ("data:p",)))
     text = index_page("runs", listed)
 
     tiles = dict(re.findall(r"<dt>(\w+)</dt><dd>(\d+)</dd>", text))
@@ -301,9 +300,9 @@ def test_index_sums_its_runs() -> None:
 
 def test_index_orders_categories_of_equal_counts() -> None:
     """Labels come from a set, whose order differs from one process to the next."""
-    info = {"counts": {"frames": 1}, "seconds": {}, "warnings": []}
+    info = {"counts": {"frames": 1}, "seconds": {}}
     pages = [
-        index_page("runs", [Listed("0.html", "run 0", info, Tally(Counter(names), 0, 0), ())])
+        index_page("runs", [Listed("0.html", "run 0", info, Tally(Counter(names), 0, 0), 0, ())])
         for names in (["cup", "can", "box", "box"], ["box", "can", "cup", "box"])
     ]
 

@@ -37,12 +37,17 @@ _SCRIPTS = ("labels.js", "meaning.js", "saving.js", "cards.js", "frames.js", "ke
 
 @dataclass(frozen=True)
 class Listed:
-    """A run in the index; ``faces`` are pictures of some of its tracks as data URIs."""
+    """A run in the index.
+
+    ``warnings`` is the number of warnings on its page; ``faces`` are pictures of some of its tracks
+    as data URIs.
+    """
 
     link: str
     name: str
     info: Mapping[str, Any]
     tally: Tally
+    warnings: int
     faces: tuple[str, ...]
 
 
@@ -275,8 +280,8 @@ def _listed(item: Listed) -> str:
     notes += [f"{item.tally.unsure} uncertain"] if item.tally.unsure else []
     notes += [f"{item.tally.checked} checked"] if item.tally.checked else []
     faces = "".join(f'<img alt="" src="{face}">' for face in item.faces)
-    warnings = len(item.info["warnings"])
-    warn = f' · <span class="warn">⚠ {plural(warnings, "warning")}</span>' if warnings else ""
+    warnings = plural(item.warnings, "warning")
+    warn = f' · <span class="warn">⚠ {warnings}</span>' if item.warnings else ""
     return (
         f'<a class="run" href="{escape(item.link)}"><div><h3>{escape(item.name)}</h3>'
         f'<p class="muted">{escape(" · ".join(notes))}{warn}</p></div>'

@@ -76,8 +76,7 @@ class RunReport:
         OutputError : the tracks.csv of the run is invalid, or the run has been replaced.
         """
         require_work(self.folder, self.work)
-        table, reason = self._table, self.pictures.reason
-        notes = [f"surfaces are drawn from their meshes, without points: {reason}"]
+        table = self._table
         return run_page(
             read_finished(self.folder),
             table,
@@ -85,7 +84,7 @@ class RunReport:
             self.pictures.frames,
             self.stages,
             length_s=self.length_s,
-            notes=notes if reason else [],
+            notes=self._notes,
             apart=self.apart,
             index=self.index,
             served=served,
@@ -104,8 +103,15 @@ class RunReport:
             name=finished.name,
             info=finished.info,
             tally=count_cards(cards, finished.labels),
+            warnings=len(finished.info["warnings"]) + len(self._notes),
             faces=_faces(cards, finished.labels),
         )
+
+    @property
+    def _notes(self) -> list[str]:
+        """Warnings about the page, beside those of the run."""
+        reason = self.pictures.reason
+        return [f"surfaces are drawn from their meshes, without points: {reason}"] if reason else []
 
     @property
     def _table(self) -> TrackTable:
