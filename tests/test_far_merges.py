@@ -2,8 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,11 @@ from click.testing import Result
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from shapecat.outputs.report.writing import Reports, RunReport
 from shapecat.runs.labels import far_merges as module
 from shapecat.runs.labels.corrections import relabel
 from shapecat.runs.labels.far_merges import Gap, _distances, far_merges
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.types import AnnotationBox
-from tests.browser import Browser
 from tests.mcap_files import read_ros
 
 Shapecat = Callable[..., Result]
@@ -108,7 +105,12 @@ def test_parts_of_one_object_are_merged_without_a_warning(
     """#6 and #9 are the ends of one object, with #7 between them; #2 is another one."""
     gaps = [((2, 6), 0.31), ((2, 9), 0.46), ((6, 7), 0.0), ((6, 9), 0.145), ((7, 9), 0.02)]
     found = [Gap(pair, 5, distance) for pair, distance in gaps]
-    monkeypatch.setattr(module, "read_gaps", lambda *_: found)
+
+    def read_gaps(_: Path, objects: Mapping[int, int]) -> list[Gap]:
+        pairs = [[objects.get(track) for track in gap.tracks] for gap in found]
+        return [gap for gap, (a, b) in zip(found, pairs, strict=True) if a == b is not None]
+
+    monkeypatch.setattr(module, "_read_gaps", read_gaps)
 
     def merged(**numbers: int) -> dict[int, TrackLabel]:
         return {int(name[1:]): TrackLabel(number, "can", 1.0) for name, number in numbers.items()}
@@ -117,22 +119,3 @@ def test_parts_of_one_object_are_merged_without_a_warning(
     assert far_merges(tmp_path, merged(t2=2, t6=7, t7=7, t9=7)) == []
     assert far_merges(tmp_path, merged(t2=2, t6=9, t7=7, t9=9)) == [found[3]]
     assert far_merges(tmp_path, merged(t2=7, t6=7, t7=7, t9=7)) == found[:2]
-
-
-def test_page_warns_of_merge_with_an_object_elsewhere(
-    browser: Browser, run: Path, drawn: RunReport
-) -> None:
-    gaps = {pair: np.mean(values) for pair, values in true_gaps(run).items()}
-    a, b = max(gaps, key=lambda pair: gaps[pair])
-    (page,) = Reports([replace(drawn, folder=run)]).write()
-    browser.open(page)
-    said = "return document.getElementById('said').textContent"
-
-    for one, other in ((a, b), (b, a)):
-        browser.type(f"#track-{one} .other", f"merge with #{other}\n")
-        text = browser.run(said)
-        (distance,) = re.findall(r"both are in the same frames, (\d+) cm apart", text)
-        assert 0.7 * gaps[a, b] < int(distance) / 100 < gaps[a, b] + 0.01
-        browser.click(f"#track-{one} button[data-label='unknown']")
-        assert "apart" not in browser.run(said)
-    assert browser.complaints() == []

@@ -45,12 +45,6 @@ function learn(label) {
   showDigits();
 }
 
-// Return a warning if a label merges a track with one that is in another place at the same time.
-function doubt(track, label) {
-  const merge = label.match(MERGE), far = merge && data.apart[track]?.[merge[1]];
-  return far ? `, although both are in the same frames, ${far} cm apart` : "";
-}
-
 // Give a track a label; if the label is invalid, change nothing and return the problem.
 function setLabel(track, label) {
   const before = labels.get(track);
@@ -65,7 +59,7 @@ function setLabel(track, label) {
 function put(track, label) {
   labels.set(track, label);
   learn(label);
-  say(inWords(track, label) + doubt(track, label), doubt(track, label) !== "");
+  say(inWords(track, label));
   refresh(track);
   save(track);
 }

@@ -26,7 +26,6 @@ from shapecat.outputs.report.cards import (
 )
 from shapecat.outputs.report.pictures import StripFrame
 from shapecat.runs.finished import FinishedRun
-from shapecat.runs.labels.far_merges import Gap
 from shapecat.runs.labels.track_table import TrackTable
 from shapecat.types import CATEGORIES, UNKNOWN
 
@@ -60,7 +59,6 @@ def run_page(
     *,
     length_s: float,
     notes: Sequence[str] = (),
-    apart: Sequence[Gap] = (),
     index: str | None = None,
     served: bool = False,
 ) -> str:
@@ -73,7 +71,6 @@ def run_page(
     stages : (frames,) seconds of each stage.
     length_s : time from the first to the last frame, seconds.
     notes : warnings to show after those of the run.
-    apart : tracks in different places in the same frames; merging them gives a warning.
     index : link to the index of several runs; None if there is none.
     served : whether corrections are sent to a server; if not, the page offers a table to download.
     """
@@ -110,7 +107,7 @@ def run_page(
         facts=_facts(run),
         glossary=asset("glossary.html"),
         names="".join(f'<option value="{escape(name)}">' for name in names),
-        data=_data(names, run, table, apart, served=served),
+        data=_data(names, run, table, served=served),
     )
 
 
@@ -226,14 +223,7 @@ def _facts(run: Mapping[str, Any]) -> str:
     )
 
 
-def _data(
-    names: Sequence[str],
-    run: Mapping[str, Any],
-    table: TrackTable,
-    apart: Sequence[Gap],
-    *,
-    served: bool,
-) -> str:
+def _data(names: Sequence[str], run: Mapping[str, Any], table: TrackTable, *, served: bool) -> str:
     """Return the data for the script as JSON, escaped so that it cannot end the script element."""
     rows = [
         {
@@ -244,10 +234,6 @@ def _data(
         }
         for row in table.rows
     ]
-    distances: dict[int, dict[int, int]] = {}
-    for gap in apart:
-        for track, other in (gap.tracks, gap.tracks[::-1]):
-            distances.setdefault(track, {})[other] = round(100 * gap.distance_m)
     content = {
         "columns": table.columns,
         "rows": rows,
@@ -255,7 +241,6 @@ def _data(
         "known": [UNKNOWN, *CATEGORIES, *run["model"]["categories"]],
         "oneFrame": run["fixed_frame"] is not None,
         "colours": {name: hex_colour(name) for name in names},
-        "apart": distances,
         "served": served,
         "key": _key(run, table),
     }

@@ -24,7 +24,6 @@ from shapecat.outputs.report.tracks import Timeline, read_length, read_stage_sec
 from shapecat.runs.finished import find_runs, read_finished
 from shapecat.runs.folder import require_work
 from shapecat.runs.labels.corrections import read_original_table
-from shapecat.runs.labels.far_merges import Gap, read_gaps
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.labels.track_table import TrackTable
 from shapecat.system.files import replacing
@@ -51,7 +50,6 @@ class RunReport:
     stages : (frames,) seconds of each stage.
     length_s : time from the first to the last frame, seconds.
     index : link to the index of several runs; None if there is none.
-    apart : tracks in different places in the same frames.
     """
 
     folder: Path
@@ -61,7 +59,6 @@ class RunReport:
     stages: Mapping[str, F8]
     length_s: float
     index: str | None = None
-    apart: Sequence[Gap] = ()
 
     def page(self, *, served: bool = False) -> str:
         """Return the page with the current labels in tracks.csv.
@@ -85,7 +82,6 @@ class RunReport:
             self.stages,
             length_s=self.length_s,
             notes=self._notes,
-            apart=self.apart,
             index=self.index,
             served=served,
         )
@@ -233,16 +229,8 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
     rows = read_original_table(folder / "tracks.csv")[0].rows
     timelines = read_timelines(folder)
     pictures = take_pictures(finished, rows, choose_frames(folder, timelines))
-    return RunReport(
-        folder,
-        finished.info["work"],
-        timelines,
-        pictures,
-        read_stage_seconds(folder),
-        read_length(folder),
-        index,
-        [gap for gap in read_gaps(folder, timelines) if gap.is_far],
-    )
+    work, stages = finished.info["work"], read_stage_seconds(folder)
+    return RunReport(folder, work, timelines, pictures, stages, read_length(folder), index)
 
 
 def _failed_recordings(manifest: Path) -> set[str]:

@@ -1,6 +1,6 @@
 """Find merged tracks that are in different places in the same frames: not parts of one object."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from shapecat.runs.labelled_tracks import LabelledTracks, read_annotation_frames
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.types import AnnotationBox
 
-__all__ = ["Gap", "far_merges", "read_gaps"]
+__all__ = ["Gap", "far_merges"]
 
 _FAR_M = 0.05
 """Smallest mean gap between tracks that are not parts of one object; parts mostly touch."""
@@ -35,24 +35,6 @@ class Gap(NamedTuple):
         return self.distance_m > _FAR_M
 
 
-def read_gaps(folder: Path, tracks: Iterable[int]) -> list[Gap]:
-    """Return the gap between each two of the given tracks that have common frames.
-
-    Raises
-    ------
-    OutputError : a table of the run is unreadable, or the tables do not fit together.
-    """
-    unmerged = {track: TrackLabel(track, "", 0.0) for track in tracks}
-    gaps: dict[tuple[int, int], list[float]] = {}
-    for frame in read_annotation_frames(folder, LabelledTracks.read(folder, unmerged)):
-        boxes = sorted(frame.objects)
-        if len(boxes) > 1:
-            distances = _distances(boxes)
-            for (i, a), (j, b) in combinations(enumerate(boxes), 2):
-                gaps.setdefault((a.track, b.track), []).append(float(distances[i, j]))
-    return [Gap(pair, len(found), float(np.mean(found))) for pair, found in sorted(gaps.items())]
-
-
 def far_merges(folder: Path, labels: Mapping[int, TrackLabel]) -> list[Gap]:
     """Return the gaps between merged tracks that are too far apart to be one object.
 
@@ -64,7 +46,7 @@ def far_merges(folder: Path, labels: Mapping[int, TrackLabel]) -> list[Gap]:
 
     Raises
     ------
-    OutputError : as for `read_gaps`.
+    OutputError : a table of the run is unreadable, or the tables do not fit together.
     """
     groups: dict[int, list[int]] = {}
     for track, label in labels.items():
@@ -72,13 +54,28 @@ def far_merges(folder: Path, labels: Mapping[int, TrackLabel]) -> list[Gap]:
     merged = [track for group in groups.values() if len(group) > 1 for track in group]
     if not merged:
         return []
-    gaps = read_gaps(folder, merged)
-    gaps = [gap for gap in gaps if len({labels[track].track for track in gap.tracks}) == 1]
+    gaps = _read_gaps(folder, {track: labels[track].track for track in merged})
     bodies = {track: {track} for track in merged}
     for a, b in (gap.tracks for gap in gaps if not gap.is_far):
         bodies[a] |= bodies[b]
         bodies |= dict.fromkeys(bodies[a], bodies[a])
     return [gap for gap in gaps if gap.tracks[1] not in bodies[gap.tracks[0]]]
+
+
+def _read_gaps(folder: Path, objects: Mapping[int, int]) -> list[Gap]:
+    """Return the gap between each two tracks of the same object that have common frames."""
+    unmerged = {track: TrackLabel(track, "", 0.0) for track in objects}
+    sums: dict[tuple[int, int], tuple[int, float]] = {}
+    for frame in read_annotation_frames(folder, LabelledTracks.read(folder, unmerged)):
+        boxes = sorted(frame.objects)
+        if len(boxes) < 2:
+            continue
+        distances = _distances(boxes)
+        for (i, a), (j, b) in combinations(enumerate(boxes), 2):
+            if objects[a.track] == objects[b.track]:
+                count, total = sums.get((a.track, b.track), (0, 0.0))
+                sums[a.track, b.track] = count + 1, total + float(distances[i, j])
+    return [Gap(pair, count, total / count) for pair, (count, total) in sorted(sums.items())]
 
 
 def _distances(boxes: Sequence[AnnotationBox]) -> F8:
