@@ -5,7 +5,8 @@ from shapecat.recordings.frames import FrameRange, frames
 from shapecat.recordings.messages import Channel, Message, MessageError, Topic
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.streams import Stream, choose_streams, depth_streams
-from shapecat.recordings.transforms.buffer import TransformBuffer, fixed_frame, read_transforms
+from shapecat.recordings.transforms.buffer import TransformBuffer, fixed_frame
+from shapecat.recordings.transforms.reading import read_transforms
 
 __all__ = [
     "Channel",

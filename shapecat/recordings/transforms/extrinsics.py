@@ -17,8 +17,8 @@ from shapecat.recordings.transforms.buffer import (
     ExtrapolationError,
     TransformBuffer,
     TransformError,
-    read_transforms,
 )
+from shapecat.recordings.transforms.reading import read_transforms
 from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.types import Pose
 

@@ -5,11 +5,8 @@ from copy import deepcopy
 
 from shapecat.recordings.look_ahead import AROUND_NS, LookAhead, is_read_at_once
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.transforms.buffer import (
-    TransformBuffer,
-    TransformReader,
-    read_transforms,
-)
+from shapecat.recordings.transforms.buffer import TransformBuffer
+from shapecat.recordings.transforms.reading import TransformReader, read_transforms
 from shapecat.recordings.transforms.topics import is_latched, transform_topics
 
 __all__ = ["TransformWindow"]
