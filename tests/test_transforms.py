@@ -2,6 +2,7 @@
 
 import tracemalloc
 from bisect import bisect_right
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from shapecat.geometry import quaternion_from_rotation
 from shapecat.recordings import TransformBuffer, fixed_frame, open_recording, read_transforms
 from shapecat.recordings.transforms.buffer import (
     ExtrapolationError,
+    GapError,
     TransformError,
     TransformLoopError,
 )
@@ -130,6 +132,91 @@ def test_extrapolation_beyond_tolerance_is_an_error() -> None:
         buffer.lookup("map", "base", 899_999_999)
     with pytest.raises(ExtrapolationError, match="after the last"):
         buffer.lookup("map", "base", 2_100_000_001)
+
+
+def published(
+    times_ms: Iterable[int], pose: Callable[[int], Any], *, static: bool = False
+) -> TransformBuffer:
+    """Return the transforms of ``base`` in ``map`` at some times after ``EPOCH``."""
+    buffer = TransformBuffer()
+    if static:
+        buffer.add("map", "base", 0, moved(9.0), static=True)
+    for time in times_ms:
+        buffer.add("map", "base", EPOCH + time * 10**6, pose(time), static=False)
+    return buffer
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_transform_is_unknown_within_a_gap(static: bool) -> None:
+    """Poses that were interpolated over 3 s were wrong by 10 cm; a placeholder is wrong as well."""
+    buffer = published(
+        [*range(0, 301, 100), *range(1700, 2200, 100)], lambda t: moved(t * 1e-4), static=static
+    )
+    known = buffer.lookup("map", "base", EPOCH + 1600 * 10**6)
+
+    assert known.translation[0] == pytest.approx(0.16)
+    assert buffer.lookup("map", "base", EPOCH + 400 * 10**6).translation[0] == pytest.approx(0.04)
+    for time_ms in (401, 1000, 1599):
+        with pytest.raises(GapError, match=r"base at 17\d+ ns: that is within a gap of 1.400 s"):
+            buffer.lookup("map", "base", EPOCH + time_ms * 10**6)
+
+
+@pytest.mark.parametrize("missing", [1, 2, 3])
+@pytest.mark.parametrize("interval_ms", [20, 400, 1000])
+def test_gap_is_longer_than_the_usual_interval(interval_ms: int, missing: int) -> None:
+    """Localization may publish once per second: then a second without it is no gap."""
+    times = [k * interval_ms for k in range(20) if not 10 <= k < 10 + missing]
+    buffer = published(times, lambda t: moved(t * 1e-3))
+    gap_ms = (missing + 1) * interval_ms
+    within = EPOCH + (9 * interval_ms + gap_ms // 2) * 10**6
+
+    if missing == 3 and gap_ms > 500:
+        with pytest.raises(GapError):
+            buffer.lookup("map", "base", within)
+    else:
+        x = buffer.lookup("map", "base", within).translation[0]
+        assert x == pytest.approx((9 * interval_ms + gap_ms / 2) * 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("pose", "known"),
+    [
+        (moved(1.0), True),
+        (moved(1.008), True),
+        (moved(1.012), False),
+        (moved(1.0, 0.007), True),
+        (moved(1.0, 0.011), False),
+    ],
+)
+def test_gap_without_motion_is_bridged(pose: Any, known: bool) -> None:
+    """A robot at rest loses nothing, though its encoders are noisy."""
+    times = [*range(0, 1000, 100), *range(3000, 4000, 100)]
+    buffer = published(times, lambda t: pose if t >= 3000 else moved(1.0))
+
+    if known:
+        x = buffer.lookup("map", "base", EPOCH + 2 * SECOND).translation[0]
+        assert x == pytest.approx(1.0, abs=0.01)
+    else:
+        with pytest.raises(GapError):
+            buffer.lookup("map", "base", EPOCH + 2 * SECOND)
+
+
+def test_equal_transforms_count_in_the_usual_interval() -> None:
+    """Those of a robot at rest are not kept; its next gap was as long as the interval left."""
+    times = [*range(0, 3000, 100), *range(5000, 8000, 100)]
+    buffer = published(times, lambda t: moved(float(t >= 5000)))
+
+    with pytest.raises(GapError):
+        buffer.lookup("map", "base", EPOCH + 4 * SECOND)
+
+
+def test_frame_that_changes_its_parent_in_a_gap_is_unknown_there() -> None:
+    buffer = published(range(0, 1000, 100), lambda _: moved(1.0))
+    for time in range(3000, 4000, 100):
+        buffer.add("odom", "base", EPOCH + time * 10**6, moved(1.0), static=False)
+
+    with pytest.raises(GapError):
+        buffer.lookup("map", "base", EPOCH + 2 * SECOND)
 
 
 def test_lookup_errors_name_missing_link() -> None:

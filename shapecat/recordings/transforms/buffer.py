@@ -12,6 +12,7 @@ from typing import Any
 from shapecat.errors import ShapecatError, listed
 from shapecat.geometry import IDENTITY, compose, inverse
 from shapecat.recordings.transforms.samples import (
+    TOLERANCE_NS,
     TransformSample,
     TransformTrack,
     interpolated,
@@ -21,14 +22,13 @@ from shapecat.types import Pose
 
 __all__ = [
     "ExtrapolationError",
+    "GapError",
     "TransformBuffer",
     "TransformError",
     "TransformLoopError",
     "fixed_frame",
 ]
 
-_TOLERANCE_NS = 100_000_000
-"""A transform is assumed constant for this long before its first sample and after its last one."""
 _FARTHEST_M = 1e9
 """Transforms with a larger translation are rejected as damaged."""
 _DEEPEST = 200
@@ -41,6 +41,22 @@ class TransformError(ShapecatError):
 
 class ExtrapolationError(TransformError):
     """The time of a look-up is before the first or after the last transform of a frame."""
+
+
+class GapError(TransformError):
+    """The time of a look-up is in a gap between two transforms that differ.
+
+    Attributes
+    ----------
+    frame_id : the frame whose transforms have the gap.
+    gap_s : length of the gap, seconds.
+    """
+
+    def __init__(self, frame_id: str, stamp_ns: int, gap_s: float) -> None:
+        """Describe a gap."""
+        self.frame_id, self.gap_s = frame_id, gap_s
+        where = f"that is within a gap of {gap_s:.3f} s"
+        super().__init__(f"no transform of {frame_id} at {stamp_ns} ns: {where}")
 
 
 class TransformLoopError(TransformError):
@@ -135,7 +151,7 @@ class TransformBuffer:
 
         Raises
         ------
-        ExtrapolationError : a transform on the way is not known at that time.
+        ExtrapolationError, GapError : a transform on the way is not known at that time.
         TransformLoopError : the frames form a loop.
         TransformError : no transform names one of the frames, or no chain of transforms connects
             them.
@@ -177,7 +193,7 @@ class TransformBuffer:
         if track is None:
             return None
         stamps = track.stamps
-        known = stamps if stamp_ns is None else max(track.gaps_ns(stamp_ns)) <= _TOLERANCE_NS
+        known = stamps if stamp_ns is None else max(track.gaps_ns(stamp_ns)) <= TOLERANCE_NS
         if track.static is not None and not known:
             return track.static.parent
         at = len(stamps) if stamp_ns is None else bisect_right(stamps, stamp_ns)
@@ -194,7 +210,7 @@ class TransformBuffer:
         track = self._tracks[frame_id]
         stamps = track.stamps
         late, early = track.gaps_ns(stamp_ns)
-        if max(late, early) > _TOLERANCE_NS:
+        if max(late, early) > TOLERANCE_NS:
             if track.static is not None:
                 return pose_of(track.static)
             side = (
@@ -207,6 +223,8 @@ class TransformBuffer:
         at = bisect_right(stamps, stamp_ns)
         if at in {0, len(stamps)}:
             return pose_of(track[max(0, at - 1)])
+        if gap_ns := track.unseen_ns(at, stamp_ns):
+            raise GapError(frame_id, stamp_ns, gap_ns * 1e-9)
         before, after = track[at - 1], track[at]
         if before.parent != after.parent or before == after:
             return pose_of(before)

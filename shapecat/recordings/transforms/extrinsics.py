@@ -15,6 +15,7 @@ from shapecat.recordings.sensors import is_of_realsense_recorder, same_frame
 from shapecat.recordings.streams import Stream, first_message
 from shapecat.recordings.transforms.buffer import (
     ExtrapolationError,
+    GapError,
     TransformBuffer,
     TransformError,
 )
@@ -75,7 +76,7 @@ class Extrinsics:
         with suppress(TransformError):
             try:
                 return buffer.lookup(colour_frame, depth_frame, stamp_ns)
-            except ExtrapolationError:
+            except (ExtrapolationError, GapError):
                 self._recording.warn(
                     f"{self._colour.topic}: no transform from {depth_frame} to {colour_frame} "
                     "at the time of some frames"

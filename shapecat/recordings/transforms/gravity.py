@@ -12,7 +12,7 @@ from shapecat.geometry import LINK_FROM_OPTICAL, compose, unit_direction
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.sensors import same_frame
 from shapecat.recordings.streams import Stream
-from shapecat.recordings.transforms.buffer import TransformError, fixed_frame
+from shapecat.recordings.transforms.buffer import GapError, TransformError, fixed_frame
 from shapecat.recordings.transforms.imu import Accelerometers
 from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.types import Frame, Pose
@@ -84,7 +84,10 @@ class Upright:
     sources : ``tf`` and ``imu``, in the order in which they are tried; empty if there is a vector.
     warnings : for the user.
     dropped : by topic, the source of an up direction that is ignored.
-    failed, first_failure : the number of failed look-ups, and the error of the first.
+    failed, first_failure : the number of failed look-ups, and the error of the first, other than in
+        gaps.
+    in_gaps, longest_gap : the number of frames without pose in gaps between transforms, and the
+        longest gap.
     given : the number of frames by the source of their up direction.
     misnamed : by topic, the ``named_from_data`` of a `Misnaming` that was found.
     sensors : the frame ids of all sensors, as far as they are known.
@@ -100,6 +103,8 @@ class Upright:
     dropped: dict[str, str] = field(default_factory=dict)
     failed: int = 0
     first_failure: str = ""
+    in_gaps: int = 0
+    longest_gap: GapError | None = None
     given: dict[str, int] = field(default_factory=dict)
     misnamed: dict[str, F8] = field(default_factory=dict)
     sensors: tuple[str, ...] = ()
@@ -168,7 +173,7 @@ class Upright:
             self.fixed_frame = self._choose_fixed_frame(frame)
         if self.fixed_frame is None:
             return None
-        return self._lookup(self.fixed_frame, frame)
+        return self._lookup(self.fixed_frame, frame, places=True)
 
     def _choose_fixed_frame(self, first: Frame) -> str | None:
         """Choose one fixed frame for all sensors, preferably one named map, odom or world.
@@ -263,8 +268,11 @@ class Upright:
                 return f"imu, {sensor.topic}", np.asarray(up, np.float32)
         return "", None
 
-    def _lookup(self, target: str, frame: Frame) -> Pose | None:
-        """Return the pose of the sensor in the frame ``target``; None if it is unknown."""
+    def _lookup(self, target: str, frame: Frame, *, places: bool = False) -> Pose | None:
+        """Return the pose of the sensor in the frame ``target``; None if it is unknown.
+
+        Gaps are counted only if the look-up ``places`` the sensor in the fixed frame.
+        """
         transforms = self.transforms.around(frame.log_time_ns, frame.stamp_ns)
         offset = frame.frame_from_sensor
         if offset is not None and target == frame.frame_id.lstrip("/"):  # it may be in no transform
@@ -272,10 +280,14 @@ class Upright:
         try:
             pose = transforms.lookup(target, frame.frame_id, frame.stamp_ns)
             return pose if offset is None else compose(pose, offset)
+        except GapError as gap:
+            self.in_gaps += places
+            if places and (self.longest_gap is None or gap.gap_s > self.longest_gap.gap_s):
+                self.longest_gap = gap
         except TransformError as error:
             self.failed += 1
             self.first_failure = self.first_failure or str(error)
-            return None
+        return None
 
 
 def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:

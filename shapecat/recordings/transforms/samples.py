@@ -1,5 +1,6 @@
 """The transforms from one frame to its parent over time, and interpolation between them."""
 
+import math
 from array import array
 from bisect import bisect_right
 from typing import NamedTuple
@@ -10,10 +11,22 @@ from shapecat.arrays import F8
 from shapecat.geometry import rotation_from_quaternion
 from shapecat.types import Pose
 
-__all__ = ["TransformSample", "TransformTrack", "interpolated", "pose_of"]
+__all__ = ["TOLERANCE_NS", "TransformSample", "TransformTrack", "interpolated", "pose_of"]
 
-
+TOLERANCE_NS = 100_000_000
+"""A transform is assumed constant for this long before its first sample and after its last one, and
+near the ends of a gap."""
 _NEVER_NS = 2**63
+_GAP_NS = 500_000_000
+"""Shorter intervals between two samples are no gaps: slow localization publishes as rarely."""
+_UNUSUAL = 3
+"""A gap is longer than this many of the other intervals, on average: a transform that is always
+published rarely has no gaps."""
+_LONGEST_NS = 10_000_000_000
+"""Longer intervals count as this long in the mean: what lies between may not have been read."""
+_MOVED_M = 0.01
+"""If the samples around a gap are nearer than this and `_TURNED`, the frame was at rest."""
+_TURNED = math.radians(0.5)
 
 
 class TransformSample(NamedTuple):
@@ -39,6 +52,7 @@ class TransformTrack:
         self.latched = False
         self.static: TransformSample | None = None
         self.stamps = array("q")
+        self._intervals = self._span_ns = 0  # number and sum of the intervals between samples
         self._parents: list[str] = []
         self._numbers = array("d")  # seven per sample
 
@@ -56,12 +70,32 @@ class TransformTrack:
             return _NEVER_NS, _NEVER_NS
         return 0 if self.latched else stamp - self.stamps[-1], self.stamps[0] - stamp
 
+    def unseen_ns(self, at: int, stamp: int) -> int:
+        """Return the length of the gap that a stamp is in, ns; 0 if the transform is known there.
+
+        In a gap, the transform changes in an unknown way.
+
+        Parameters
+        ----------
+        at : number of the sample after ``stamp``, at least 1.
+        """
+        begin, end = self.stamps[at - 1], self.stamps[at]
+        gap = end - begin
+        if gap <= _GAP_NS or min(stamp - begin, end - stamp) <= TOLERANCE_NS:
+            return 0
+        others = self._intervals - 1, self._span_ns - min(gap, _LONGEST_NS)
+        usual = gap * others[0] <= _UNUSUAL * others[1]
+        return 0 if usual or _are_close(self[at - 1], self[at]) else gap
+
     def add(self, stamp: int, sample: TransformSample) -> None:
         """Insert a sample by time; it replaces one with the same stamp.
 
         Of three equal samples in a row, the middle one is dropped.
         """
         at, count = bisect_right(self.stamps, stamp), len(self.stamps)
+        if at == count > 0 and stamp > self.stamps[-1]:
+            self._intervals += 1
+            self._span_ns += min(stamp - self.stamps[-1], _LONGEST_NS)
         if at and self.stamps[at - 1] == stamp:
             self._set(slice(at - 1, at), stamp, sample)
         elif at == count >= 2 and sample == self[count - 1] == self[count - 2]:
@@ -85,6 +119,16 @@ class TransformTrack:
 def pose_of(sample: TransformSample) -> Pose:
     """Return a sample as the pose ``parent_from_child``."""
     return Pose(rotation_from_quaternion(sample.quaternion), np.array(sample.translation))
+
+
+def _are_close(a: TransformSample, b: TransformSample) -> bool:
+    """Return whether two samples are the same, but for noise."""
+    cosine = abs(sum(p * q for p, q in zip(a.quaternion, b.quaternion, strict=True)))
+    return (
+        a.parent == b.parent
+        and math.dist(a.translation, b.translation) < _MOVED_M
+        and cosine > math.cos(_TURNED / 2)
+    )
 
 
 def interpolated(a: TransformSample, b: TransformSample, share: float) -> Pose:

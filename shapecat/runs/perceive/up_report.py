@@ -18,7 +18,7 @@ _DISAGREE_DEG = 10
 def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
     """Return the source of the up direction and its agreement with the planes, for run.json.
 
-    Failed look-ups, their consequences, and large differences are added to the warnings of
+    Failed look-ups, gaps, their consequences, and large differences are added to the warnings of
     ``upright``.
 
     Parameters
@@ -29,6 +29,13 @@ def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
         upright.warnings.append(
             f"failed transform look-ups: {upright.failed}, the first: {upright.first_failure}"
         )
+    if upright.longest_gap is not None:
+        gap = upright.longest_gap
+        upright.warnings.append(
+            f"frames without pose ({upright.in_gaps}×): gaps of up to {gap.gap_s:.2f} s in the "
+            f"transforms of {gap.frame_id}, which moves meanwhile"
+        )
+    if upright.failed or upright.in_gaps:
         upright.warnings += _missing_poses(folder, upright.fixed_frame)
     uses = upright.given
     report: dict[str, Any] = {"source": max(uses, key=lambda name: uses[name], default="planes")}
