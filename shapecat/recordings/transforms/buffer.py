@@ -11,6 +11,7 @@ from typing import Any
 
 from shapecat.errors import ShapecatError, listed
 from shapecat.geometry import IDENTITY, compose, inverse
+from shapecat.recordings.transforms.delays import Delays
 from shapecat.recordings.transforms.samples import (
     TOLERANCE_NS,
     TransformSample,
@@ -90,6 +91,7 @@ class TransformBuffer:
         *,
         static: bool,
         latched: bool = False,
+        log_time_ns: int | None = None,
     ) -> bool:
         """Add a transform, unless it is invalid.
 
@@ -98,6 +100,7 @@ class TransformBuffer:
         parent_from_child : translation (x, y, z) in metres and quaternion (x, y, z, w).
         static : whether it is valid whenever there is no other one; ``stamp_ns`` is then ignored.
         latched : whether it is valid until the next one, however late that is.
+        log_time_ns : its log time; None if it is unknown.
 
         Returns
         -------
@@ -124,7 +127,25 @@ class TransformBuffer:
         else:
             track.latched |= latched
             track.add(stamp_ns, sample)
+            if log_time_ns is not None:
+                track.note(log_time_ns, stamp_ns, sample)
         return True
+
+    @property
+    def moves(self) -> bool:
+        """Whether any frame moves."""
+        return any(track.moves for track in self._tracks.values())
+
+    def delays_between(self, target: str, source: str) -> list[Delays]:
+        """Return the delays of the transforms that move between two frames.
+
+        The list is empty if nothing moves, or the frames are not connected.
+        """
+        with suppress(TransformLoopError):
+            ways = [set(self._ancestors(name.lstrip("/"))) for name in (target, source)]
+            tracks = [self._tracks[name] for name in ways[0] ^ ways[1] if name in self._tracks]
+            return [t.delays for t in tracks if t.moves] if ways[0] & ways[1] else []
+        return []
 
     def root_of(self, frame_id: str) -> str:
         """Return the root of a frame's tree, according to the latest transforms.

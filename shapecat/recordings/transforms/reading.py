@@ -56,7 +56,8 @@ class TransformReader:
         try:
             for transform in self._recording.decode(message).transforms:
                 stamp = stamp_ns(transform.header) or message.log_time_ns
-                if not self._add(transform, stamp, static=static, latched=latched):
+                times = stamp, message.log_time_ns
+                if not self._add(transform, times, static=static, latched=latched):
                     self._recording.warn("skipped invalid transforms (NaN, no name)")
                 if not static:
                     self.lag_ns = max(self.lag_ns, abs(stamp - message.log_time_ns))
@@ -64,14 +65,18 @@ class TransformReader:
             reason = reason_of(error, message.topic)
             self._recording.warn(f"skipped transforms: {message.topic}: {reason}")
 
-    def _add(self, transform: Any, stamp: int, *, static: bool, latched: bool) -> bool:
-        """Add a decoded geometry_msgs/TransformStamped; return False if it is invalid."""
+    def _add(self, transform: Any, times: tuple[int, int], *, static: bool, latched: bool) -> bool:
+        """Add a decoded geometry_msgs/TransformStamped; return False if it is invalid.
+
+        ``times`` are its stamp and its log time, nanoseconds.
+        """
         move, turn = transform.transform.translation, transform.transform.rotation
         return self.buffer.add(
             transform.header.frame_id,
             transform.child_frame_id,
-            stamp,
+            times[0],
             ((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)),
             static=static,
             latched=latched,
+            log_time_ns=times[1],
         )

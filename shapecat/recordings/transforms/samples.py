@@ -9,6 +9,7 @@ import numpy as np
 
 from shapecat.arrays import F8
 from shapecat.geometry import rotation_from_quaternion
+from shapecat.recordings.transforms.delays import Delays
 from shapecat.types import Pose
 
 __all__ = ["TOLERANCE_NS", "TransformSample", "TransformTrack", "interpolated", "pose_of"]
@@ -42,17 +43,21 @@ class TransformTrack:
 
     Attributes
     ----------
+    delays : the delays of the samples, which need not be sorted by stamp.
     latched : whether the last transform remains valid for ever.
+    moves : whether some samples differ by more than noise.
     static : the static transform, valid when no other one is; None if there is none.
     stamps : stamps of the samples, nanoseconds.
     """
 
     def __init__(self) -> None:
         """Start without samples."""
-        self.latched = False
+        self.delays = Delays()
+        self.latched = self.moves = False
         self.static: TransformSample | None = None
         self.stamps = array("q")
         self._intervals = self._span_ns = 0  # number and sum of the intervals between samples
+        self._first: TransformSample | None = None
         self._parents: list[str] = []
         self._numbers = array("d")  # seven per sample
 
@@ -102,6 +107,12 @@ class TransformTrack:
             self.stamps[-1] = stamp
         else:
             self._set(slice(at, at), stamp, sample)
+
+    def note(self, log_time_ns: int, stamp_ns: int, sample: TransformSample) -> None:
+        """Take note of the log time of a sample; compare it with the first one."""
+        if self.delays.add(log_time_ns, stamp_ns) and not self.moves:
+            self._first = self._first or sample
+            self.moves = not _are_close(self._first, sample)
 
     def forget(self, stamp: int) -> None:
         """Remove the samples before a time (ns), except the last one at or before it."""

@@ -6,6 +6,7 @@ from copy import deepcopy
 from shapecat.recordings.look_ahead import AROUND_NS, LookAhead, is_read_at_once
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.transforms.buffer import TransformBuffer
+from shapecat.recordings.transforms.delays import Delays
 from shapecat.recordings.transforms.reading import TransformReader, read_transforms
 from shapecat.recordings.transforms.topics import is_latched, transform_topics
 
@@ -61,6 +62,15 @@ class TransformWindow:
             return cls(buffer, end.buffer, ahead)
         ahead.read_all()
         return cls(buffer)
+
+    @property
+    def moves(self) -> bool:
+        """Whether any frame moves, by the transforms so far."""
+        return self._known.moves
+
+    def delays_between(self, target: str, source: str) -> list[Delays]:
+        """Return the delays of the transforms that move between two frames; see the buffer's."""
+        return self._known.delays_between(target, source)
 
     def around(self, log_time_ns: int, stamp_ns: int) -> TransformBuffer:
         """Return the transforms for a frame, given its log time and stamp in nanoseconds."""

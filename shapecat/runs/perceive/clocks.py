@@ -1,13 +1,14 @@
-"""Warn if the clocks of two sensors differ, since their computers are not synchronized."""
+"""Warn if the clocks of sensors and transforms differ: their computers are not synchronized."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.runs.tables.reading import numbers, read_by_topic
 
-__all__ = ["explain_clocks"]
+__all__ = ["explain_clocks", "explain_transform_clocks"]
 
 _DIFFERENT_S = 0.3
 """Smallest difference of two clocks that causes a warning. Drivers' delays differ by less."""
@@ -38,3 +39,38 @@ def explain_clocks(folder: Path) -> Iterator[str]:
             "poses of a moving sensor are wrong, and a moving object gets two tracks; synchronize "
             "the clocks of the computers"
         )
+
+
+def explain_transform_clocks(
+    folder: Path, transforms: TransformWindow, fixed_frame: str, frame_ids: Mapping[str, str]
+) -> Iterator[str]:
+    """Yield a warning for each sensor whose clock is not that of the transforms that move it.
+
+    Their delays are compared at the same log times, since a simulation may be slower than the
+    recorder's clock. If several frames move the sensor, the one with the most similar delay counts:
+    localization may stamp its transforms with a time in the future.
+
+    Parameters
+    ----------
+    folder : folder with the table of frames.
+    transforms : the transforms, after all frames were looked up.
+    frame_ids : the frame of each topic's data.
+    """
+    times = ["stamp_ns", "log_time_ns"]
+    logs = read_by_topic(
+        folder, times, lambda frames: np.column_stack([numbers(frames[name]) for name in times])
+    )
+    for topic, (stamps, log_times) in ((topic, both.T) for topic, both in logs.items()):
+        delays, frame_id = log_times - stamps, frame_ids[topic]
+        clocks = [clock for clock in transforms.delays_between(fixed_frame, frame_id) if clock]
+        if not clocks or not delays.any():  # without stamps, log times replace them
+            continue
+        behind = [float(np.median(delays - clock.at(log_times))) * 1e-9 for clock in clocks]
+        behind_s = min(behind, key=abs)
+        if abs(behind_s) > _DIFFERENT_S:
+            side = "behind" if behind_s > 0 else "ahead of"
+            yield (
+                f"the clock of {topic} is {abs(behind_s):.2f} s {side} that of the transforms, by "
+                "their log times: poses of its sensor are wrong or unknown; synchronize the clocks "
+                f"of the computers; --fixed-frame {frame_id} processes this recording without poses"
+            )

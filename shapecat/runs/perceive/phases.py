@@ -20,6 +20,7 @@ from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.transforms.gravity import Upright
 from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
+from shapecat.runs.perceive.clocks import explain_transform_clocks
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.perceive.second_look import Revision, frames_to_revise
 from shapecat.runs.perceive.selection import count_frames, read_frames
@@ -89,6 +90,11 @@ def perceive_all(work: Work) -> None:
     if resumed:
         run["counts"]["resumed"] = resumed
     run["fixed_frame"], run["up"] = upright.fixed_frame, report_up(upright, folder)
+    if upright.fixed_frame is not None:
+        frame_ids = {stream.topic: stream.frame_id for stream in work.streams}
+        upright.warnings += explain_transform_clocks(
+            folder, upright.transforms, upright.fixed_frame, frame_ids
+        )
     lost = [f"skipped frames ({n}×): {reason}" for reason, n in skipped.most_common(3)]
     run["warnings"] = [*lost, *recording.warnings, *upright.warnings, *recent.warnings()]
     if recording.damaged:
