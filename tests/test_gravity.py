@@ -476,6 +476,41 @@ def test_frames_without_pose_are_reported_with_what_they_cost(
     assert upright.warnings[1:] == [f"/d: the pose of its sensor in map is {loss}"]
 
 
+@pytest.mark.parametrize(
+    ("link", "frame_id", "moves", "reported"),
+    [
+        (("odom", "base"), "", True, True),
+        (("odom", "base"), "cam_unknown", True, True),
+        ((OPTICAL, "imu"), OPTICAL, True, True),  # the sensor is the root of its tree
+        (("odom", "base"), "cam_unknown", False, False),  # a camera at rest needs no pose
+        (("odom", OPTICAL), OPTICAL, True, False),
+    ],
+)
+def test_sensor_without_fixed_frame_is_reported_if_something_moves(
+    link: tuple[str, str], frame_id: str, moves: bool, reported: bool, tmp_path: Path
+) -> None:
+    """A warning named failed look-ups, but not that tracks moved with the camera."""
+    items = []
+    for topic, stamp, message in stream(MAKE, 4):
+        if not topic.startswith("/tf"):
+            message.header.frame_id = frame_id
+            items.append((topic, stamp, message))
+        elif topic == "/tf":
+            x = (stamp - EPOCH) / SECOND * moves
+            pose = Pose(LINK_FROM_OPTICAL.rotation, np.array([x, 0, 1]))
+            items.append((topic, stamp, MAKE.transforms([(*link, pose)], stamp)))
+    path = write(tmp_path / "a.mcap", items)
+    process(Job(path, tmp_path / "out", mcap=False, rrd=False))
+    run = read_run(tmp_path / "out")
+
+    warning = (
+        "/camera/depth/image_raw: no transforms lead from the frame of its sensor to a fixed "
+        "frame: its tracks are in the frame of the sensor, which may move"
+    )
+    assert run["fixed_frame"] == ("odom" if link == ("odom", OPTICAL) else None)
+    assert run["warnings"].count(warning) == reported
+
+
 def test_frame_with_objects_does_not_count_as_without_plane(tmp_path: Path) -> None:
     """An assumed plane is in no table; the run would contradict its own warning."""
     for name, schema, frames, of_other in (

@@ -35,8 +35,7 @@ def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
             f"frames without pose ({upright.in_gaps}×): gaps of up to {gap.gap_s:.2f} s in the "
             f"transforms of {gap.frame_id}, which moves meanwhile"
         )
-    if upright.failed or upright.in_gaps:
-        upright.warnings += _missing_poses(folder, upright.fixed_frame)
+    upright.warnings += _missing_poses(folder, upright)
     uses = upright.given
     report: dict[str, Any] = {"source": max(uses, key=lambda name: uses[name], default="planes")}
     if upright.dropped:
@@ -55,9 +54,19 @@ def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
     return report
 
 
-def _missing_poses(folder: Path, fixed_frame: str | None) -> Iterator[str]:
-    """Yield a warning for each topic with frames whose pose in the fixed frame is unknown."""
-    if fixed_frame is None:  # all tracks are in the sensor frame
+def _missing_poses(folder: Path, upright: Upright) -> Iterator[str]:
+    """Yield a warning for each topic with frames whose pose in the fixed frame is unknown.
+
+    Without a fixed frame, there is a warning if something moves, since it may be the sensor.
+    """
+    fixed_frame = upright.fixed_frame
+    if fixed_frame is None and upright.transforms.moves:
+        for topic in count_poses(folder):
+            yield (
+                f"{topic}: no transforms lead from the frame of its sensor to a fixed frame: its "
+                "tracks are in the frame of the sensor, which may move"
+            )
+    if fixed_frame is None or not (upright.failed or upright.in_gaps):
         return
     for topic, (with_pose, count) in count_poses(folder).items():
         loss = ", whose objects are not tracked"
