@@ -496,6 +496,28 @@ def test_calibration_recorded_once_is_used_for_all_images(tmp_path: Path, first_
     assert not warnings
 
 
+@pytest.mark.parametrize("zeros", [(0,), (0, 1), (1,), (2,), (0, 1, 2)])
+def test_calibrations_of_zeros_do_not_replace_one(tmp_path: Path, zeros: Sequence[int]) -> None:
+    """Some drivers publish zeros at first; a valid calibration of another time is better."""
+    items: list[tuple[str, int, Any]] = []
+    for k in range(3):
+        stamp = EPOCH + k * 50 * MS
+        calibration = info(stamp, WIDE)
+        if k in zeros:
+            calibration.k, calibration.p = np.zeros(9), np.zeros(12)
+        items.append(("/cam/color/camera_info", stamp, calibration))
+        items += depth_items(stamp, frame_id="color")
+        items.append(("/cam/color/image_raw", stamp, raw(stamp, gradient(60, 80), "rgb8", "color")))
+    pairs, warnings = read(write(tmp_path / "a.mcap", items))
+
+    lenses = [view and view.lens and view.lens.pinhole for _, view in pairs]
+    assert lenses == [WIDE if len(zeros) < 3 else None] * 3
+    if len(zeros) == 3:
+        assert any("CameraInfo without intrinsics" in warning for warning in warnings)
+    else:
+        assert not warnings
+
+
 def test_colour_without_transform_is_unused(tmp_path: Path) -> None:
     """Misplaced colours are worse than no colours."""
     ((_, view),), warnings = read(paired(tmp_path / "a.mcap"))

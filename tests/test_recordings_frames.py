@@ -573,7 +573,7 @@ def test_unreadable_calibration_is_searched_once(
 
     assert not found
     assert skipped == {"depth image without CameraInfo": 30}
-    assert decoded["/depth/camera_info"] < 30 + 10
+    assert decoded["/depth/camera_info"] <= 30 + 30  # as they come, and in one search
 
 
 def test_mismatched_calibration_is_counted_with_its_topic(tmp_path: Path) -> None:

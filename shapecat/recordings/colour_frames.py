@@ -10,17 +10,23 @@ from typing import Any, NamedTuple, TypeAlias
 from shapecat.cameras.colour import ColourView, LensCamera
 from shapecat.errors import RecordingError
 from shapecat.geometry import IDENTITY, compose
+from shapecat.recordings.calibrations import first_calibration
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.decoding.colour_image import colour_image
 from shapecat.recordings.frames import ALL_FRAMES, FrameRange, frames
 from shapecat.recordings.lens import distortion_problem
 from shapecat.recordings.messages import MALFORMED, Message, MessageError, Needed, reason_of
-from shapecat.recordings.pinhole import camera_of_info, distortion_of, is_rectified
+from shapecat.recordings.pinhole import (
+    camera_of_info,
+    distortion_of,
+    has_intrinsics,
+    is_rectified,
+)
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.registration import are_equal, are_similar, is_straight
 from shapecat.recordings.sensors import is_of_realsense_recorder, same_frame
 from shapecat.recordings.stamps import Clock, stamp_ns
-from shapecat.recordings.streams import Stream, first_message
+from shapecat.recordings.streams import Stream
 from shapecat.recordings.transforms.extrinsics import Extrinsics
 from shapecat.types import Camera, Frame
 
@@ -183,8 +189,10 @@ class _Partner:
         if content == self._calibration:
             return
         try:
-            self._lens = _lens_of(self._recording.decode(message), self.stream.topic)
-            self._calibration = content
+            info = self._recording.decode(message)
+            if has_intrinsics(info) or self._first_lens is None:  # else there is a better one
+                self._lens = _lens_of(info, self.stream.topic)
+                self._calibration = content
         except (RecordingError, *MALFORMED) as error:
             self._left_out[f"CameraInfo: {reason_of(error, self.stream.topic)}"] += 1
 
@@ -290,7 +298,7 @@ class _Partner:
         It serves images that precede all calibrations.
         """
         topic = self.stream.info_topic
-        info = None if topic is None else first_message(self._recording, topic)
+        info = None if topic is None else first_calibration(self._recording, topic)
         with suppress(RecordingError, *MALFORMED):
             return None if info is None else _lens_of(info, self.stream.topic)
         return None

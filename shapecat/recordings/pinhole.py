@@ -16,6 +16,7 @@ __all__ = [
     "camera_of_info",
     "distortion_of",
     "fit_pinhole",
+    "has_intrinsics",
     "is_rectified",
     "off_center",
     "sample_pixels",
@@ -190,6 +191,12 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
     # Coefficients that are all zero mean a rectified image, as in image_geometry of ROS, even with
     # a fisheye model: drivers that rectify its images set only the coefficients to zero.
     return camera, bool(not (rectified or use_p) and np.any(d != 0))
+
+
+def has_intrinsics(info: Any) -> bool:
+    """Return whether a decoded CameraInfo has a focal length: some drivers publish zeros first."""
+    k, p = _field(info, "k"), _field(info, "p")
+    return bool((k.size and k[0] > _UNIT) or (p.size == 12 and p[0] > _UNIT))
 
 
 def off_center(camera: Camera) -> bool:

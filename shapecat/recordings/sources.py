@@ -12,6 +12,7 @@ import numpy as np
 from shapecat.arrays import F4
 from shapecat.errors import RecordingError
 from shapecat.geometry import transform
+from shapecat.recordings.calibrations import first_calibration
 from shapecat.recordings.decoding.compressed_depth import depth_of_compressed
 from shapecat.recordings.decoding.depth_image import depth_of_image
 from shapecat.recordings.decoding.foxglove import ros_counterpart
@@ -22,6 +23,7 @@ from shapecat.recordings.pinhole import (
     PinholeFit,
     camera_of_info,
     fit_pinhole,
+    has_intrinsics,
     is_rectified,
     off_center,
     still_fits,
@@ -138,10 +140,15 @@ class DepthSource(Source):
         self._info_stamp: int | None = None
 
     def calibrate(self, message: Message) -> Iterator[Frame]:
-        """Store a calibration; yield the frame of the image that waited for it, if any."""
+        """Store a calibration; yield the frame of the image that waited for it, if any.
+
+        One without intrinsics does not replace an earlier one.
+        """
         try:
             info = self.recording.decode(message)
             stamp = stamp_ns(info.header)
+            if not has_intrinsics(info):
+                info = self._info
         except (RecordingError, *MALFORMED) as error:
             reason = reason_of(error, message.topic)
             self.recording.warn(f"skipped a CameraInfo: {message.topic}: {reason}")
@@ -186,7 +193,7 @@ class DepthSource(Source):
     @cached_property
     def _first_info(self) -> Any:
         """The first calibration in the recording, for images before it; None if there is none."""
-        return first_message(self.recording, self.info_topic)
+        return first_calibration(self.recording, self.info_topic)
 
     def _content(self, image: Any) -> dict[str, Any]:
         if self._info is None:

@@ -1,0 +1,29 @@
+"""Find a usable calibration of a camera: some drivers publish zeros before they know it."""
+
+from contextlib import suppress
+from itertools import islice
+from typing import Any
+
+from shapecat.recordings.messages import MALFORMED, MessageError
+from shapecat.recordings.pinhole import has_intrinsics
+from shapecat.recordings.recording import Recording
+
+__all__ = ["first_calibration"]
+
+_SEARCHED = 300
+"""Number of messages to search: ten seconds at 30 Hz."""
+
+
+def first_calibration(recording: Recording, topic: str) -> Any:
+    """Return the first decoded CameraInfo of a topic that has intrinsics.
+
+    If none of the first few hundred has, return the first one; None if none can be decoded.
+    """
+    first = None
+    for message in islice(recording.messages([topic]), _SEARCHED):
+        with suppress(MessageError, *MALFORMED):
+            info = recording.decode(message)
+            if has_intrinsics(info):
+                return info
+            first = info if first is None else first
+    return first
