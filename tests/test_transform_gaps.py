@@ -36,16 +36,16 @@ def gappy(path: Path, missing: range, *, moves: bool = True) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("missing", "moves", "lost"),
+    ("missing", "moves", "lost", "link"),
     [
-        (range(4, 10), True, [5, 6, 7, 8]),
-        (range(2, 12), True, list(range(3, 11))),
-        (range(4, 8), True, []),  # 0.5 s: as rarely as some localization publishes
-        (range(2, 12), False, []),
+        (range(4, 10), True, [5, 6, 7, 8], "base_link"),
+        (range(2, 12), True, list(range(3, 11)), "camera_link"),
+        (range(4, 8), True, [], ""),  # 0.5 s: as rarely as some localization publishes
+        (range(2, 12), False, [], ""),
     ],
 )
 def test_frames_in_a_gap_have_no_pose_and_a_warning(
-    missing: range, moves: bool, lost: list[int], tmp_path: Path
+    missing: range, moves: bool, lost: list[int], link: str, tmp_path: Path
 ) -> None:
     """Poses that were interpolated over seconds were wrong by 10 cm, and nothing said so."""
     path = gappy(tmp_path / "a.mcap", missing, moves=moves)
@@ -59,7 +59,7 @@ def test_frames_in_a_gap_have_no_pose_and_a_warning(
     gaps = f"frames without pose ({len(lost)}×): gaps of up to {(len(missing) + 1) / 10:.2f} s in"
     unknown = f"/camera/depth/image_raw: the pose of its sensor in map is unknown in {len(lost)} of"
     expected = [
-        f"{gaps} the transforms of camera_link, which moves meanwhile",
+        f"{gaps} the transforms of {link}, which moves meanwhile",
         f"{unknown} {FRAMES} frames{cost}",
     ]
     assert read_run(tmp_path / "out")["warnings"] == (expected if lost else [])

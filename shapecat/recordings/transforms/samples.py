@@ -25,9 +25,10 @@ _UNUSUAL = 3
 published rarely has no gaps."""
 _LONGEST_NS = 10_000_000_000
 """Longer intervals count as this long in the mean: what lies between may not have been read."""
-_MOVED_M = 0.01
-"""If the samples around a gap are nearer than this and `_TURNED`, the frame was at rest."""
-_TURNED = math.radians(0.5)
+_MOVED_M = 0.02
+"""If the samples around a gap are nearer than this and `_TURNED`, they are interpolated: the frame
+was at rest, as in transforms that are published only on change, or localization corrected it."""
+_TURNED = math.radians(1)
 
 
 class TransformSample(NamedTuple):
