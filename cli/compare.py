@@ -31,8 +31,9 @@ def compare(
 ) -> None:
     """Compare a run with ground truth, other labels, or another run.
 
-    TRUTH is the NAME.truth.json that `shapecat simulate` writes (or the recording beside it), a
-    COCO file, a KITTI folder that contains label_2, or another run of the same recording.
+    TRUTH is the NAME.truth.json that `shapecat simulate` writes, or the simulated recording beside
+    that file; a COCO file; a KITTI folder that contains label_2; or another run of the same
+    recording.
     Frames are matched by timestamp, or by number if TRUTH has no timestamps.
 
     \b

@@ -21,7 +21,8 @@ from .render import note_off_support, print_json, progress_bars
     type=ANY_PATH,
     metavar="TRAINING_SET",
     help="Train shapecat's model and simpler classifiers on these views and compare them on "
-    "DATASET. If TRAINING_SET is DATASET, use cross-validation by instance with up to five folds.",
+    "DATASET. If TRAINING_SET is DATASET, use cross-validation by instance with up to five folds; "
+    "it needs two objects of each category.",
 )
 @json_option
 def evaluate(
@@ -31,8 +32,7 @@ def evaluate(
 
     Print accuracy, confusion matrix, calibration error and novelty detection, and the accuracy
     after fusing 3, 10 and 30 views of an instance. DATASET is laid out as for `shapecat train`.
-    The model must know every category of DATASET. Cross-validation needs two objects of each
-    category.
+    The model must know every category of DATASET.
 
     \b
     --baselines compares these classifiers with shapecat's own:
@@ -40,7 +40,7 @@ def evaluate(
     linear        logistic regression on shapecat's descriptor
     pnn           probabilistic neural network on shapecat's descriptor
     forest leaves (thesis)
-                  linear classifiers on the leaves of a forest
+                  linear classifiers on the leaves of a forest (Mueller 2012)
     forest on D2  random forest on the distribution of point distances
     forest on D2, D3, A3 (ESF-like)
                   random forest on distributions of distances, areas and angles

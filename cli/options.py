@@ -64,7 +64,9 @@ array_option = click.option(
     is_flag=True,
     help="Print a JSON array with one object per recording that did not fail.",
 )
-config_option = click.option("--config", type=ANY_PATH, help="TOML file with settings.")
+config_option = click.option(
+    "--config", type=ANY_PATH, help="TOML file with settings, listed in docs/reference.md."
+)
 set_option = click.option(
     "--set",
     "overrides",

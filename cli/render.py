@@ -121,7 +121,9 @@ def note_off_support(categories: Sequence[str]) -> None:
 def note_skipped(learned: Mapping[str, Any]) -> None:
     """Report on stderr the defective views in the data set of `train` or `learn`.
 
-    These are skipped views, categories that have lost all views, and views in another frame.
+    These are the number of skipped views, the categories left without views, and the categories
+    whose views mostly do not stand at z = 0. ``learned`` is the result of `train_on_folder` or
+    `learn_on_folder`.
     """
     note_off_support(learned["off_support"])
     if learned["skipped"]:
