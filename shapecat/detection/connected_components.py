@@ -83,6 +83,7 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
 
 @kernel(inner=True)
 def _root(parent: I4, k: int) -> int:
+    """Return the root of element ``k`` in a union-find forest, ``parent`` (n,)."""
     while parent[k] != k:
         k = parent[k]
     return k

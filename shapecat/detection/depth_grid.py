@@ -120,7 +120,10 @@ def discontinuity_at(depth_m: float) -> float:
 
 @kernel
 def _sampled(depth: F4, step: int, range_m: float) -> F4:
-    """Return the depths in range at every ``step``-th row and column, (n,) metres."""
+    """Return the depths in range at every ``step``-th row and column, (n,) metres.
+
+    ``depth`` (height, width) and ``range_m`` are as in `downsample`.
+    """
     rows, columns = depth.shape
     result = np.zeros((rows // step + 1) * (columns // step + 1), np.float32)
     n, one, min_depth = np.uint64(0), np.uint64(1), np.float32(NEAREST_M)
@@ -134,7 +137,10 @@ def _sampled(depth: F4, step: int, range_m: float) -> F4:
 
 @kernel(inner=True)
 def row_and_column(p: int, columns: int) -> tuple[int, int]:
-    """Return row and column of a flat cell index. A multiplication replaces the slower division."""
+    """Return row and column of a flat cell index. A multiplication replaces the slower division.
+
+    ``p`` is ``row * columns + column``.
+    """
     i = int((p + 0.5) * (1.0 / columns))
     return i, p - i * columns
 
@@ -147,7 +153,10 @@ def back_project(k: PinholeIntrinsics, i: float, j: float, z: float) -> tuple[fl
 
 @kernel(inner=True)
 def project(k: PinholeIntrinsics, x: float, y: float, z: float) -> tuple[int, int]:
-    """Return row and column of the cell that sees a point, metres; it may be outside the grid."""
+    """Return row and column of the cell that sees a point; it may be outside the grid.
+
+    The point ``x``, ``y``, ``z`` is in metres, in the frame of the grid's camera.
+    """
     return int(k.cy + k.fy * y / z + 0.5), int(k.cx + k.fx * x / z + 0.5)
 
 
@@ -155,6 +164,7 @@ def smallest_object_at(grid: DepthGrid, depth_m: F4) -> F4:
     """Return the number of cells (n,) that the smallest object covers at each of the depths (n,).
 
     Its visible area is `SMALL_M2`; the result is at least `MIN_CELLS` and at most `ENOUGH_CELLS`.
+    ``depth_m`` (n,) is in metres.
     """
     covered = SMALL_M2 * grid.intrinsics.fx**2 / depth_m.astype(np.float64) ** 2
     return np.clip(covered, MIN_CELLS, ENOUGH_CELLS).astype(np.float32)
@@ -195,7 +205,11 @@ def find_borders(inv_depth: F4, band: int) -> I4:
 
 @kernel
 def _average(depth: F4, factor: int, range_m: float, jump: float, inv_depth: F4) -> None:
-    """Write the inverse of each cell's mean depth, over the pixels close to its nearest pixel."""
+    """Write the inverse of each cell's mean depth, over the pixels close to its nearest pixel.
+
+    ``depth`` (height, width) and ``range_m`` are as in `downsample`; ``factor`` and ``jump``
+    (``discontinuity``) as in `DepthGrid`. Writes to ``inv_depth`` (rows, columns), 1/m.
+    """
     if factor == 2:  # the usual case, in a form that vectorises
         _average_two(depth, range_m, jump, inv_depth)
         return
@@ -235,6 +249,7 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, inv_depth: F4)
 
 @kernel(inline=True)
 def _average_two(depth: F4, range_m: float, jump: float, inv_depth: F4) -> None:
+    """Do as `_average` does with a ``factor`` of 2, in a form that vectorises."""
     rows, columns = inv_depth.shape
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
     no_depth, min_depth = np.float32(1e9), np.float32(NEAREST_M)

@@ -111,6 +111,7 @@ def detect(
 
 
 def _detect_in_image(depth: F4, camera: Camera, hint: F8 | None, task: Task) -> Scene | None:
+    """Return the scene of a depth image (h, w); ``hint`` is as in `model_planes`."""
     range_m = task.settings.max_range_m
     grid = downsample(depth, camera, range_m=range_m)
     segmentation = None if grid is None else _segment(grid, hint, task)
@@ -121,6 +122,7 @@ def _detect_in_image(depth: F4, camera: Camera, hint: F8 | None, task: Task) -> 
 
 
 def _detect_in_cloud(points: F4, hint: F8 | None, task: Task) -> Scene | None:
+    """Return the scene of a cloud (n, 3), metres; ``hint`` is as in `detect`, but a unit vector."""
     view = virtual_image(points, range_m=task.settings.max_range_m)
     segmentation = None if view is None else _segment_view(view, hint, task)
     if segmentation is None:
@@ -141,6 +143,7 @@ def _detect_in_cloud(points: F4, hint: F8 | None, task: Task) -> Scene | None:
 
 
 def _segment_view(view: VirtualImage, hint: F8 | None, task: Task) -> Segmentation | None:
+    """Find planes and objects in a virtual image; ``hint`` is in the frame of the cloud."""
     view_hint = None if hint is None else view.view_from_sensor.rotation @ hint
     return _segment(view.grid, view_hint, task, upright=False)
 
@@ -182,7 +185,11 @@ def model_planes(
 def _find_planes(
     grid: DepthGrid, hint: F8 | None, trials: F8, settings: DetectionSettings, *, upright: bool
 ) -> tuple[F8, Records, HeightMap] | None:
-    """Return the up direction, the supporting planes, and the height map; None without a plane."""
+    """Return the up direction (3,), the supporting planes and the height map; None without a plane.
+
+    The planes are from `pack_planes`. ``hint`` and ``upright`` are as in `model_planes`, ``trials``
+    from `draw_trials`.
+    """
     max_height_m = settings.max_height_m
     supports, up = find_supporting_planes(
         grid, hint, trials, max_height_m=max_height_m, upright=upright
@@ -208,7 +215,8 @@ def _find_assumed_plane(
 ) -> SupportingPlane | None:
     """Return a plane assumed below the samples that no plane and no wall explains.
 
-    Return None if such samples are few, or if the plane would be above the camera.
+    Return None if such samples are few, or if the plane would be above the camera. ``up`` and
+    ``trials`` are as in `remove_walls`.
     """
     unexplained = find_unexplained(grid, heights.plane_id)
     if unexplained is not None:

@@ -135,7 +135,8 @@ def _dominant_plane(sample: F8, hint: F8 | None, rng: np.random.Generator) -> F8
 def _sum_of_directions(points: F4, origin: F8, range_m: float) -> tuple[F8, int]:
     """Return the sum (3,) of unit vectors to the points within twice the range, and their number.
 
-    The vectors start at ``origin``.
+    The vectors start at ``origin`` (3,); ``points`` are (n, 3); ``range_m`` is the range; all
+    metres.
     """
     ax = ay = az = 0.0
     n = 0
@@ -158,8 +159,9 @@ def _to_view(
     """Transform the points in view to the frame of the virtual camera; return their number.
 
     Writes the points to ``in_view`` (n, 3), their slopes x / z and y / z to ``slopes`` (n, 2), and
-    the smallest and largest slopes to ``bounds`` (4,): left, top, right, bottom. Points out of view
-    get the slope `OUTSIDE`.
+    the smallest and largest slopes to ``bounds`` (4,): left, top, right, bottom. Points out of
+    view, or deeper than ``range_m``, metres, get the slope `OUTSIDE`. ``rotation`` (3, 3) and
+    ``translation`` (3,) map ``points`` (n, 3) to that frame.
     """
     r, s = rotation, translation
     n = 0
@@ -196,6 +198,11 @@ def _rotation_to(axis: F8) -> F8:
 
 
 def _render(in_view: F4, slopes: F4, bounds: F8, n: int, pose: Pose) -> VirtualImage:
+    """Return the image of points; ``pose`` maps their original frame to that of the virtual camera.
+
+    ``in_view``, ``slopes`` and ``bounds`` are from `_to_view`; ``n`` is the number of points in
+    view.
+    """
     left, top, right, bottom = (float(v) for v in bounds)
     width, height = right - left, bottom - top
     z = in_view[:: max(1, n // 20_000), 2]
@@ -221,7 +228,7 @@ def _spacing(slopes: F4, bounds: F8, n: int) -> float:
     """Return the width of a cell, in slope, with which nearly every cell of a surface has a point.
 
     In a fine grid every point has a cell of its own. Coarser grids are tried until an occupied cell
-    holds `POINTS_PER_CELL` points on average.
+    holds `POINTS_PER_CELL` points on average. The parameters are as in `_render`.
     """
     span = max(bounds[2] - bounds[0], bounds[3] - bounds[1], 1e-6)
     side = 1024
@@ -236,6 +243,10 @@ def _spacing(slopes: F4, bounds: F8, n: int) -> float:
 
 @kernel
 def _count_occupied(slopes: F4, left: float, top: float, scale: float, side: int) -> int:
+    """Return how many cells of a grid of ``side`` rows and columns have a point.
+
+    The grid begins at the slopes ``left`` and ``top``, with ``scale`` cells per unit of slope.
+    """
     occupied = np.zeros((side, side), np.uint8)
     n = 0
     for k in range(slopes.shape[0]):
@@ -254,8 +265,9 @@ def _project(
 ) -> int:
     """Average the inverse depth of each cell's nearest points; count the points well behind them.
 
-    Writes to ``inv_depth`` and to ``cell``; returns the count. ``jump`` is the step in inverse
-    depth that separates two surfaces, 1/m.
+    Writes to ``inv_depth`` (rows, columns), and the flat index of the cell of each point to
+    ``cell`` (n,); returns the count. ``points`` (n, 3) and ``slopes`` (n, 2) are from `_to_view`.
+    ``jump`` is the step in inverse depth that separates two surfaces, 1/m.
     """
     rows, columns = inv_depth.shape
     nearest = np.zeros(inv_depth.shape, np.float32)
@@ -291,7 +303,8 @@ def _project(
 def _close_holes(inv_depth: F4, jump: float) -> None:
     """Fill each empty cell that lies between two neighbours on one surface with their mean.
 
-    Opposite neighbours are on one surface if they differ by less than ``jump``, 1/m.
+    Opposite neighbours are on one surface if they differ by less than ``jump``, 1/m. ``inv_depth``
+    (rows, columns) is changed in place.
     """
     rows, columns = inv_depth.shape
     source = inv_depth.copy()

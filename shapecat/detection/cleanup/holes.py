@@ -58,7 +58,8 @@ def fill_holes(grid: DepthGrid, labels: I4, count: int, filled: U1) -> None:
 def _between_labels(inv_depth: F4, labels: I4) -> tuple[Bool, I4]:
     """Return where unlabelled samples are between labels, and the span of the labels in each row.
 
-    A sample is between labels if a label lies in each of the four directions.
+    A sample is between labels if a label lies in each of the four directions. The results are
+    (rows, columns) and (rows, 2); ``inv_depth`` and ``labels`` are (rows, columns).
     """
     rows, columns = labels.shape
     first, last = np.full(columns, rows, np.int32), np.full(columns, -1, np.int32)
@@ -87,11 +88,13 @@ def _count_sides(
     total: I4,
     area: I4,
 ) -> None:
-    """Count the sides and the cells of the holes, in place.
+    """Count the sides and the cells of the holes 1..n - 1, in place.
 
     ``sides`` (n, labels, 3) holds the counts `BOUNDARY`, `IN_FRONT` and `CONTINUOUS` of the sides
     with each label; ``total`` (n,) also counts sides without a label. ``area`` (n,) counts cells.
-    Cells without depth beside a hole belong to the hole; the label beyond them is its neighbour.
+    ``inside`` and ``spans`` are from `_between_labels`; ``component`` (rows, columns) is the hole
+    of each cell inside. Cells without depth beside a hole belong to the hole; the label beyond them
+    is its neighbour.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     for i in range(len(spans)):
@@ -116,7 +119,7 @@ def _count_sides(
 
 @kernel(inline=True)
 def _count_label_cells(labels: I4, spans: I4, area: I4) -> None:
-    """Count the cells of each label, in ``area`` (labels,)."""
+    """Count the cells of each label in ``area`` (labels,); ``spans`` are from `_between_labels`."""
     for i in range(len(spans)):
         for j in range(spans[i, 0], spans[i, 1]):
             area[labels[i, j]] += 1

@@ -203,7 +203,8 @@ def _count_by_segment(
 def _measure_outside(grid: DepthGrid, plane: Row, samples: I4, out: Row) -> None:
     """Write how far samples are outside the outline of a `PLANE`: least, mean and largest distance.
 
-    The distances are in metres, negative inside.
+    The distances are in metres, negative inside. ``samples`` (n,) are flat cell indices, -1 after
+    the last.
     """
     total, n = 0.0, 0
     for s in samples:

@@ -78,7 +78,7 @@ def _find_low(
     """Write the low cells of row ``i``: their inverse depth relative to the plane, and a mark of 1.
 
     ``raw`` and ``mark`` (3, columns) hold both for the last three rows, and 0 in the other cells.
-    Returns whether the row has low cells.
+    Returns whether the row has low cells. The other parameters are as in `measure_residual`.
     """
     plane_id, height = heights
     zero, one, low = np.float32(0), np.float32(1), np.float32(LOW.low_m)
@@ -151,11 +151,12 @@ def clear_contact(
 
 @kernel
 def filter_high_pass(residual: F4, high_pass: F4) -> None:
-    """Write the residual minus its mean in a window around each low cell; 0 elsewhere.
+    """For each low cell, write its residual minus the mean of the low cells in a window around it.
 
-    Both arrays are (rows, columns), 1/m. The window slides: entering values are added and leaving
-    values subtracted, down the rows for the sums of columns, and along a row for the sums of
-    windows. Integer sums are exact, and take a quarter of the time of floating-point sums.
+    In the mean, a value counts as at most `LOW.max_value`. ``residual`` (rows, columns), 1/m, is 0
+    where a cell is not low; ``high_pass`` (rows, columns), 1/m, is written in place, and is 0 there
+    too. The sums are integers, in steps of 1 / `STEPS`, updated as the window slides: they are
+    exact, and take a quarter of the time of floating-point sums.
     """
     rows, columns = residual.shape
     sums = np.zeros(columns + 2 * LOW.window + 1, np.int32)
@@ -182,7 +183,11 @@ def filter_high_pass(residual: F4, high_pass: F4) -> None:
 
 @kernel(inner=True)
 def _slide(residual: F4, i: int, sign: int, sums: I4, counts: I4) -> None:
-    """Add a row to the sums of the columns, or subtract it (``sign`` -1)."""
+    """Add a row of ``residual`` to the sums of the columns, or subtract it (``sign`` -1).
+
+    ``sums`` and ``counts`` (columns + 2 * LOW.window + 1,) are the sum over the window's rows in
+    each column, in steps of 1 / `STEPS`, and the number of low cells; the margins stay 0.
+    """
     steps, maximum, minimum = np.float32(STEPS), np.float32(LOW.max_value), np.float32(-1)
     margin = np.uint64(LOW.window + 1)
     for j in range(np.uint64(residual.shape[1])):
@@ -193,7 +198,10 @@ def _slide(residual: F4, i: int, sign: int, sums: I4, counts: I4) -> None:
 
 @kernel(inline=True)
 def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
-    """Write the sum over the window around each column, and the number of low cells, at least 1."""
+    """Write the sum over the window around each column, and the number of low cells, at least 1.
+
+    ``sums`` and ``counts`` are from `_slide`; ``total`` and ``count`` (columns,) are written.
+    """
     width = 2 * LOW.window + 1
     window = number = np.int32(0)
     for j in range(width):

@@ -1,5 +1,6 @@
 """Low-profile objects: they rise from their plane in a step, unlike low-frequency depth error.
 
+They consist of low cells, which are on the plane or less than `LowProfileSettings.low_m` above it.
 Only an object has an edge. So low-frequency depth error is removed first (`depth_error`), and low
 parts are classified by their outline rather than by their height.
 """
@@ -104,7 +105,8 @@ def find_low_profile(
 def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
     """Return the first row of the cells of a plane, and one past the last, with a margin.
 
-    The two are equal if there is no cell. All neighbours that are read lie within the margin.
+    The two are equal if there is no cell. ``plane_id`` and ``number``, from 1, are as in
+    `HeightMap`. All neighbours that are read lie within the margin.
     """
     rows = plane_id.shape[0]
     above, on = np.int8(number), np.int8(-number)
@@ -139,7 +141,9 @@ def _mark_objects(
 
     The objects are numbered from ``objects`` + 1, the tested parts from ``parts`` + 1; the last
     numbers are returned. ``object_ids`` (rows, columns) holds the number of the object at each
-    cell, 0 elsewhere; ``high_pass`` (rows, columns) is from `filter_high_pass`.
+    cell, 0 elsewhere; ``high_pass`` (rows, columns) is from `filter_high_pass`. The cells of
+    objects become cells above the plane in ``plane_id``. The other parameters are as in
+    `measure_outline`.
     """
     flat, marks, plane_ids = high_pass.reshape(-1), object_ids.reshape(-1), plane_id.reshape(-1)
     flooded, part, seeds, stack = scratch
@@ -185,7 +189,8 @@ def _mark_objects(
 def _find_seeds(high_pass: F4, threshold: float, seeds: I4) -> int:
     """List the cells above ``threshold`` that are higher than their left and upper neighbours.
 
-    The first cell of every part above any level is among them. Returns their number. Most cells are
+    The first cell of every part above any level is among them. Writes flat indices to ``seeds``;
+    returns their number. ``high_pass`` (rows, columns) is from `filter_high_pass`. Most cells are
     below ``threshold``, so a vectorised test skips whole blocks.
     """
     rows, columns = high_pass.shape
@@ -218,7 +223,8 @@ def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) 
     """Set ``part`` to ``n`` in the cells above ``level`` that are connected with ``start``.
 
     Lists these cells in ``stack`` and returns their number. ``start`` is a flat index; ``residual``
-    must be 0 at the border of the image.
+    (rows, columns), 1/m, must be 0 at the border of the image; ``part`` is (rows, columns),
+    ``stack`` (rows * columns,).
     """
     columns = residual.shape[1]
     flat, parts = residual.reshape(-1), part.reshape(-1)
@@ -251,7 +257,8 @@ def _drop_error(
     """Assign the parts of the remaining low cells to the plane if their outline shows depth error.
 
     Cells on the side of an object are left out. The parts are numbered from ``parts`` + 1; the last
-    number is returned.
+    number is returned. ``object_ids`` is from `_mark_objects`; the other parameters are as in
+    `measure_outline`.
     """
     rows, columns = residual.shape
     _, part, seeds, stack = scratch
@@ -287,7 +294,12 @@ def _drop_error(
 
 @kernel(inline=True)
 def _is_flat(residual: F4, i: int, j: int) -> bool:
-    """Return whether the surface is flat around a low cell, unlike on the side of an object."""
+    """Return whether the surface is flat around the low cell in row ``i`` and column ``j``.
+
+    The cells two rows and two columns away are low too, and differ from it by at most `LOW.side`.
+    On the side of an object they are not, or differ more. ``residual`` (rows, columns), 1/m, is
+    from `measure_residual`.
+    """
     rows, columns = residual.shape
     value = residual[i, j]
     for di, dj in SIDES:

@@ -95,7 +95,8 @@ def measure_outline(
     Parameters
     ----------
     inv_depth : (rows, columns) 1/m.
-    residual : (rows, columns) 1/m above the plane; 0 where a cell is not low.
+    residual : (rows, columns) inverse depth minus that of the plane, 1/m; 0 in cells that are not
+        low (`LowProfileSettings.low_m`).
     plane_id : (rows, columns) as in `HeightMap`.
     part : (rows, columns) numbers of the parts.
     stack, count : the first ``count`` elements of ``stack`` are the flat indices of this part's

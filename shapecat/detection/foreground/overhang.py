@@ -78,7 +78,8 @@ def extend_overhang(
 def _find_border(plane_id: I4, number: int, i: int, border: U1) -> bool:
     """Mark the cells of row i above a plane that are next to cells of lower planes or of none.
 
-    Returns whether there are any such cells.
+    Returns whether there are any such cells. ``plane_id`` and ``number``, from 1, are as in
+    `HeightMap`; ``border`` (columns,) is written.
     """
     rows, columns = plane_id.shape
     row_above, row_below, one = max(i - 1, 0), min(i + 1, rows - 1), np.uint64(1)
@@ -118,7 +119,10 @@ def _continues(over: Overhang, i: int, j: int) -> bool:
 
 @kernel(inline=True)
 def _extend(over: Overhang, i: int, j: int, stack: I4) -> None:
-    """Assign the outside part of the object at cell (i, j) to the plane, unless it is too large."""
+    """Assign the outside part of the object at cell (i, j) to the plane, unless it is too large.
+
+    ``stack`` (rows * columns,) is work space.
+    """
     inv_depth, plane_id, number = over.grid.inverse_depth, over.heights.plane_id, over.number
     rows, columns = inv_depth.shape
     stack[0], over.visited[i, j] = i * columns + j, number

@@ -41,8 +41,9 @@ def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, max_size_m: float, trial
 
     Returns
     -------
-    (rows, columns) uint8, `CLEARED` or `ON_WALL` on walls, 0 elsewhere. A plane through the fronts
-    of many objects looks like a wall too, but all its parts are small.
+    (rows, columns) uint8: `CLEARED` where cells were removed, `ON_WALL` in the other parts of such
+    a wall, 0 elsewhere. A plane with less than `WALLS.cleared_m2` to clear, as through the fronts
+    of many objects, gets no marks.
     """
     walls = np.zeros(plane_id.shape, np.uint8)
     samples = sample_grid(grid.inverse_depth, plane_id)
@@ -68,7 +69,11 @@ def _is_wall(
     up: F8,
     max_size_m: float,
 ) -> bool:
-    """Return whether the inliers of a plane fill an area that is too large for an object."""
+    """Return whether the inliers of a plane fill an area that is too large for an object.
+
+    ``plane`` (3,) is a, b, c of its inverse depth; ``normal`` and ``up`` (3,) are unit vectors,
+    sensor frame; ``max_size_m`` is the size of the largest object.
+    """
     strips = np.zeros((2, STRIPS))
     area = _measure(intrinsics, samples, plane, normal, up, strips)
     across = along = 0.0
@@ -84,7 +89,11 @@ def _is_wall(
 def _measure(
     intrinsics: PinholeIntrinsics, samples: DepthSamples, plane: F8, normal: F8, up: F8, strips: F8
 ) -> float:
-    """Return the area of the inliers of a plane, m², and add it to the strips they lie in."""
+    """Return the area of the inliers of a plane, m², and add it to the strips they lie in.
+
+    ``strips`` (2, STRIPS) are the areas in vertical and in level strips; the other parameters are
+    as in `_is_wall`.
+    """
     total, side = 0.0, cross(normal, up)
     for k in range(samples.inverse_depth.size):
         j, i, v = samples.j[k], samples.i[k], samples.inverse_depth[k]
@@ -108,7 +117,9 @@ def _clear(
 ) -> None:
     """Clear the large connected parts of a wall; other parts may be objects in front of it.
 
-    ``axes`` (3, 3) are the normal of the wall, the horizontal direction along it, and up.
+    ``axes`` (3, 3) are the normal of the wall, the horizontal direction along it, and up. ``plane``
+    (3,) is a, b, c of the wall's inverse depth. ``walls`` and, in cleared cells, ``plane_id`` are
+    changed in place, as `remove_walls` says.
     """
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
@@ -135,8 +146,10 @@ def _clear(
 def _is_free_standing(grid: DepthGrid, axes: F8, max_size_m: float, state: U1, cells: I4) -> bool:
     """Return whether a connected part of a wall is the front of one of several objects in a row.
 
-    Such a front is no larger than an object, and ends to the left and right in front of a farther
-    surface. A wall ends behind a nearer surface or in a corner. ``axes`` are as in `_clear`.
+    Such a front is no larger than ``max_size_m``, metres, and ends to the left and right in front
+    of a farther surface. A wall ends behind a nearer surface or in a corner. ``axes`` are as in
+    `_clear`, ``state`` (rows, columns) holds the marks of cells, ``cells`` (n,) are the flat
+    indices of the part's cells.
     """
     inv_depth, k = grid.inverse_depth, grid.intrinsics
     (rows, columns), (_, side, up) = inv_depth.shape, axes
@@ -166,7 +179,8 @@ def _is_free_standing(grid: DepthGrid, axes: F8, max_size_m: float, state: U1, c
 def _flood(grid: DepthGrid, normal: F8, i: int, j: int, state: U1, stack: I4) -> tuple[int, float]:
     """Mark the connected part of a wall at cell (i, j) as `ON_WALL`; list its cells in ``stack``.
 
-    Returns the number of cells and their area, m².
+    Returns the number of cells and their area, m². ``normal`` (3,) is that of the wall, sensor
+    frame; ``state`` (rows, columns) holds the marks, `UNMEASURED` in cells to visit.
     """
     inv_depth, k = grid.inverse_depth, grid.intrinsics
     rows, columns = inv_depth.shape
@@ -189,7 +203,10 @@ def _flood(grid: DepthGrid, normal: F8, i: int, j: int, state: U1, stack: I4) ->
 
 @kernel(inline=True)
 def _mark(grid: DepthGrid, plane_id: I4, plane: F8, state: U1) -> None:
-    """Mark cells on a wall as `UNMEASURED`, unless they are on a level plane; write 0 elsewhere."""
+    """Mark cells on a wall as `UNMEASURED`, unless they are on a level plane; write 0 elsewhere.
+
+    ``plane`` (3,) is a, b, c of the wall's inverse depth; marks go to ``state`` (rows, columns).
+    """
     a, inv_depth = np.float32(plane[0]), grid.inverse_depth
     jump = np.float32(grid.discontinuity)
     for i in range(inv_depth.shape[0]):

@@ -68,7 +68,11 @@ def _find_shared_occluder(segments: Segments) -> Bool:
 
 @kernel(inner=True)
 def _local_planes(samples: I4, grid: DepthGrid, normal: F4) -> F8:
-    """Return the positions and normals of a segment's samples, (2, n, 3) metres, sensor frame."""
+    """Return the positions and normals of a segment's samples, (2, n, 3) metres, sensor frame.
+
+    ``samples`` (n,) are flat cell indices, -1 where there is none; ``normal`` is as in
+    `SurfaceGraph`.
+    """
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     n = 0
     for cell in samples:
@@ -125,7 +129,8 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
 def _is_hidden(segments: Segments, p: int, q: int, grid: DepthGrid, labels: I4, lines: F8) -> bool:
     """Return whether an occluder hides the lines (n, 2, 3) between two segments, at least in part.
 
-    Hardly any of the lines may run through free space.
+    Hardly any of the lines may run through free space. ``lines``, metres, are from `_find_partners`
+    for the segments ``p`` and ``q`` of ``labels`` (rows, columns).
     """
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     free = hidden = measured = 0

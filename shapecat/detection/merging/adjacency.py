@@ -68,7 +68,8 @@ def measure_adjacency(
 def _find_changes(links: U1, row: I4, row_below: I4, change: U1) -> bool:
     """Mark the cells of a row whose segment does not continue both to the right and down.
 
-    Returns whether there are any such cells.
+    Returns whether there are any such cells. ``row`` and ``row_below`` (columns,) are labels,
+    ``links`` (columns,) as in `SurfaceGraph`; ``change`` (columns,) is written.
     """
     for j in range(row.size):
         change[j] = (row[j] != row_below[j]) | ((row[j] > 0) & (links[j] != RIGHT | DOWN))
@@ -96,7 +97,8 @@ def _count(
     The first cell of each pair is in row ``row``. The columns of ``border`` (n, 6) are the column
     of the first cell; the row and the column of the second; 1 if the second is below the first, 0
     if it is to the right; the number of cells without depth between the two; and a number that is 0
-    unless the surface continues from one to the other.
+    unless the surface continues from one to the other. ``labels`` and ``up`` are as in
+    `measure_adjacency`.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     plane_id, height = heights.plane_id, heights.height

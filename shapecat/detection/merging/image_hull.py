@@ -26,7 +26,7 @@ def extend_hull(hull: F4, row: int, first: int, last: int) -> None:
 
 @kernel(inner=True)
 def hull_area(a: F4, b: F4) -> float:
-    """Return the area of the convex hull around two hulls (`DIRECTIONS`,), in cells.
+    """Return the area of the convex hull around hulls ``a`` and ``b`` (`DIRECTIONS`,), in cells.
 
     It is half the sum, over the sides of the polygon, of length times distance from the origin. The
     length of a side follows from its neighbours.

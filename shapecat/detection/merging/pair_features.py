@@ -134,7 +134,7 @@ def find_adjacent(segments: Segments, p: int, view_geometry: ViewGeometry) -> Bo
 
 @kernel(inline=True)
 def _face(segments: Segments, p: int, q: int, view_geometry: ViewGeometry) -> bool:
-    """Return whether two segments may be the near and the far wall of a pot, which do not touch.
+    """Return whether segments p and q may be the near and far wall of a pot, which do not touch.
 
     One wall is behind the other along the line of sight to them. This is not the optical axis: if
     the camera looks down, the walls of a pot at the left of the image are side by side.
@@ -210,6 +210,7 @@ def write_pair_features(
 
 @kernel(inline=True)
 def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) -> None:
+    """Write the features of the border between segments p and q; a cell is ``cell`` metres wide."""
     pair, reverse = segments.pairs[p, q], segments.pairs[q, p]
     border = pair.contact + pair.near + pair.in_front + reverse.in_front
     surface = pair.contact + pair.near
@@ -238,6 +239,7 @@ def _above_top(segments: Segments, p: int, q: int) -> float:
 
 @kernel(inline=True)
 def _write_relation(a: Row, b: Row, out: Row) -> None:
+    """Write the features of two `SEGMENT` records, apart from their border, to ``out``."""
     width_a, width_b = width_of(a), width_of(b)
     max_width = max(width_a, width_b)
     left, right = b.left - a.left, a.right - b.right
@@ -262,12 +264,14 @@ def _write_relation(a: Row, b: Row, out: Row) -> None:
 
 @kernel(inner=True)
 def _mean_position(row: Row) -> tuple[float, float, float]:
+    """Return the mean position x, y, z of a `SEGMENT`, metres, sensor frame."""
     n = max(row.fitted, np.float32(1))
     return row.position_x_sum / n, row.position_y_sum / n, row.position_z_sum / n
 
 
 @kernel(inner=True)
 def _mean_normal(row: Row) -> tuple[float, float, float]:
+    """Return the mean normal x, y, z of a `SEGMENT`, a unit vector, sensor frame."""
     x, y, z = row.facing_x_sum, row.facing_y_sum, row.facing_z_sum
     length = max(math.sqrt(x * x + y * y + z * z), 1e-9)
     return x / length, y / length, z / length

@@ -143,7 +143,10 @@ def roots_of(segments: Segments) -> I4:
 def _measure(
     grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, labels: I4, up: F8, segments: Segments
 ) -> None:
-    """Add the cells of labels 1..n to the statistics."""
+    """Add the cells of labels 1..n to the statistics.
+
+    ``labels`` (rows, columns) and ``up`` are as in `measure_segments`.
+    """
     inv_depth, intrinsics, side = grid.inverse_depth, grid.intrinsics, lateral_axis(up)
     plane_ids, top_area = segments.plane_id, segments.top_area
     plane_id, height = heights.plane_id, heights.height

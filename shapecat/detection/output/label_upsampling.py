@@ -37,7 +37,7 @@ def label_pixels(
 
     A pixel takes the label of its cell if their depths agree, else the label of the neighbouring
     cell whose depth agrees best. The pixel keeps that label only if it is above the plane or in a
-    filled cell.
+    cell of `Segmentation.filled`.
 
     Parameters
     ----------
@@ -65,7 +65,10 @@ def dilate_row(labels: I4, i: int, scratch: I4, dilated: I4) -> None:
 def _list_pixels(
     depth: F4, grid: DepthGrid, segmentation: Segmentation, range_m: float
 ) -> tuple[U4, I4]:
-    """Return the pixels of each label, in the form that `pixels_by_label` returns."""
+    """Return the pixels of each label, in the form that `pixels_by_label` returns.
+
+    ``depth`` and ``range_m`` are as in `label_pixels`.
+    """
     inv_depth, factor = grid.inverse_depth, grid.factor
     rows, columns = inv_depth.shape
     height, width = depth.shape
@@ -110,7 +113,11 @@ def _list_pixels(
 
 @kernel(inline=True)
 def _find_unsure(line: I4, start: int, end: int, cells: I4) -> int:
-    """Write the columns of `UNSURE` pixels to ``cells[1]``; return their number."""
+    """Write the columns of `UNSURE` pixels to ``cells[1]``; return their number.
+
+    ``line`` (width,) are the marks of a row, searched from ``start`` to ``end``; ``cells`` is (2,
+    width).
+    """
     n = 0
     for x in range(start, end, PIXELS_PER_BLOCK):
         last, any_unsure = min(x + PIXELS_PER_BLOCK, end), False
@@ -124,7 +131,10 @@ def _find_unsure(line: I4, start: int, end: int, cells: I4) -> int:
 
 @kernel(inline=True)
 def _end_of(line: I4, x: int, end: int, mark: int) -> int:
-    """Return the first column from ``x`` to ``end`` with another mark; ``end`` if there is none."""
+    """Return the first column from ``x`` to ``end`` with another mark; ``end`` if there is none.
+
+    ``line`` (width,) are the marks of a row.
+    """
     while x + PIXELS_PER_BLOCK <= end:
         all_equal = True
         for k in range(np.uint64(x), np.uint64(x + PIXELS_PER_BLOCK)):
@@ -166,7 +176,9 @@ def _code_cells(grid: DepthGrid, segmentation: Segmentation) -> tuple[I4, I4]:
 def _find_high(planes: Records, inv_depth: F4, jump: float, i: int, span: I4, high: U1) -> None:
     """Write whether all pixels that fit a cell are above each plane, for a span of row i.
 
-    A pixel fits a cell if their inverse depths differ by less than ``jump``, 1/m.
+    A pixel fits a cell if their inverse depths differ by less than ``jump``, 1/m. ``planes`` are
+    records of `PLANE`, ``inv_depth`` (rows, columns) is in 1/m, ``span`` is the first column and
+    one past the last; ``high`` (planes, columns) is written.
     """
     zero, floor = np.float32(0), np.float32(1e-3)
     base = np.float32(FRINGE * HEIGHT_NOISE)
@@ -189,7 +201,11 @@ def _find_high(planes: Records, inv_depth: F4, jump: float, i: int, span: I4, hi
 def _widen(
     code: I4, inv_depth: F4, i: int, factor: int, span: I4, wide_code: I4, wide_w: F4
 ) -> None:
-    """Copy a span of row i to full resolution; pixels beyond the last cell get its values."""
+    """Copy a span of row i to full resolution; pixels beyond the last cell get its values.
+
+    ``code`` and ``span`` are from `_code_cells`; a cell is ``factor`` pixels wide. The codes and
+    the inverse depths go to ``wide_code`` and ``wide_w`` (width,).
+    """
     start, end, two, one = np.uint64(span[0]), np.uint64(span[1]), np.uint64(2), np.uint64(1)
     if factor == 2:  # the usual case, in a form that vectorises
         for j in range(start, end):
@@ -216,9 +232,10 @@ def _mark(
 ) -> None:
     """Write the labels of a run of pixels, `UNSURE` where a closer test is needed.
 
-    ``run`` is the row, the first column, and one past the last. ``inv_depth`` and ``code`` hold the
-    values of the cells for each pixel column. A pixel fits a cell if their inverse depths differ by
-    less than ``jump``, 1/m. The loop vectorises.
+    ``run`` is the row, the first column, and one past the last. ``inv_depth`` and ``code`` (width,)
+    hold the values of the cells for each pixel column, from `_widen`; ``marks`` (width,) is
+    written. ``depth`` and ``range_m`` are as in `label_pixels`. A pixel fits a cell if their
+    inverse depths differ by less than ``jump``, 1/m. The loop vectorises.
     """
     min_depth, zero = np.float32(NEAREST_M), np.int16(0)
     unsure, bare = np.int16(UNSURE), np.int16(BARE)
@@ -273,5 +290,8 @@ def assign_labels(
 
 @kernel(inline=True)
 def _fits(inv_depth: float, z: float, jump: float) -> bool:
-    """Return whether a depth is within ``jump``, 1/m, of a cell; computed without a division."""
+    """Return whether a depth ``z`` fits the inverse depth of a cell; computed without a division.
+
+    Their inverse depths differ by less than ``jump``, 1/m.
+    """
     return bool(abs(inv_depth * z - np.float32(1)) < jump * z)

@@ -120,6 +120,7 @@ def _find_supports(segments: Segments, representatives: I4, boxes: Boxes, up: F8
 
     Object A stands on object B if A is over B, and has more contact with the upward-facing surface
     of B than with the plane. If that contact is hidden, the bottom of A must be at the top of B.
+    ``representatives`` and ``up`` are as in `measure_objects`.
     """
     count = representatives.size - 1
     supported_by, support_m = np.zeros(count, np.int64), np.zeros(count)
@@ -138,6 +139,7 @@ def _objects_below(boxes: Boxes, up: F8, k: int) -> Bool:
 
     An object may extend a little behind its visible part. If the middle of ``k`` is farther behind,
     ``k`` stands behind the object, even if the visible part of ``k`` begins at the object's top.
+    ``up`` (3,) is a unit vector, view frame.
     """
     count = boxes.center.shape[0]
     below = np.zeros(count + 1, np.bool_)
@@ -174,7 +176,10 @@ def _objects_below(boxes: Boxes, up: F8, k: int) -> Bool:
 def _supporting_object(
     segments: Segments, representatives: I4, p: int, below: Bool
 ) -> tuple[int, float]:
-    """Return the label below a segment, 0 for its plane, and the height of this support, metres."""
+    """Return the label below segment p, 0 for its plane, and the height of this support, metres.
+
+    ``representatives`` is as in `measure_objects`; ``below`` (n + 1,) is from `_objects_below`.
+    """
     pairs, statistics, segment = segments.pairs[p], segments.statistics, segments.statistics[p]
     best = 0
     for k in range(1, representatives.size):
@@ -194,7 +199,8 @@ def _supporting_object(
 def _hidden_support(segments: Segments, representatives: I4, p: int, below: Bool) -> int:
     """Return the label that has the most contact with segment ``p`` from below; 0 if there is none.
 
-    A segment that lies mostly below the top of an object is not on the object, but behind it.
+    A segment that lies mostly below the top of an object is not on the object, but behind it. The
+    parameters are as in `_supporting_object`.
     """
     statistics, pairs = segments.statistics, segments.pairs
     max_overlap = min(OUTPUT.overlap_m, (statistics[p].top - statistics[p].bottom) / 2)
@@ -215,7 +221,10 @@ def _hidden_support(segments: Segments, representatives: I4, p: int, below: Bool
 
 @kernel(inline=True)
 def _break_cycles(supported_by: I4, support_m: F8) -> None:
-    """Put objects on their plane if they would otherwise support themselves through others."""
+    """Put objects on their plane if they would otherwise support themselves through others.
+
+    ``supported_by`` and ``support_m`` (n,) are as in `ObjectMeasurements`, changed in place.
+    """
     for k in range(supported_by.size):
         support = supported_by[k]
         for _ in range(supported_by.size):
@@ -226,7 +235,10 @@ def _break_cycles(supported_by: I4, support_m: F8) -> None:
 
 @kernel(fast=True)
 def _measure_boxes(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> None:
-    """Write the boxes; the rows of ``level`` (3, 3) are the level axes in the view frame."""
+    """Write the boxes of the objects 1..n in ``labels`` (rows, columns).
+
+    The rows of ``level`` (3, 3) are the level axes in the view frame (see `Boxes`).
+    """
     points, start = _outer_points(grid, labels, level, boxes)
     for k in range(start.size - 1):
         if start[k] < start[k + 1]:
@@ -242,7 +254,8 @@ def _outer_points(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> tuple
     """Return points of each object in the level frame (3, n), and the index where each begins.
 
     The points are the outermost cells, and the cells inside at every 4th row and column, since the
-    nearest point of a ball is inside its outline. Also writes ``boxes.low`` and ``boxes.high``.
+    nearest point of a ball is inside its outline. Also writes ``boxes.low`` and ``boxes.high``. The
+    parameters are as in `_measure_boxes`.
     """
     rows, columns = labels.shape
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
@@ -284,7 +297,8 @@ def _outer_points(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> tuple
 def _find_outer(labels: I4, i: int, first: int, end: int, outer: Bool) -> None:
     """Mark the labelled cells in part of row ``i`` that are next to other labels.
 
-    In every 4th row, every 4th labelled cell is marked too.
+    In every 4th row, every 4th labelled cell is marked too. ``labels`` is (rows, columns); the part
+    is from column ``first`` to before ``end``; the marks go to ``outer`` (columns,).
     """
     rows, columns = labels.shape
     if i == 0 or i == rows - 1:

@@ -41,6 +41,11 @@ def label_occluded_points(points: F4, labels: I4, first_new: int) -> I4:
 
 @kernel
 def _spread(keys: I4, ny: int, nz: int, labels: I4, new_label: int) -> None:
+    """Spread labels of voxels to touching voxels, in place; clusters without one get new labels.
+
+    ``keys`` (n,), ascending, are ``(x * ny + y) * nz + z`` of each voxel; ``labels`` (n,) are 0
+    where there is none. New labels count from ``new_label``.
+    """
     queue = np.zeros(keys.size, np.int64)
     head = tail = 0
     for k in range(keys.size):

@@ -14,7 +14,8 @@ __all__ = ["append_run", "pixels_by_label", "split_by_label"]
 def append_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
     """Append a run of pixels after the first ``n`` rows of ``runs``; return the new number of rows.
 
-    ``runs`` is as in `pixels_by_label`; a run whose label is 0 is left out.
+    ``runs`` is as in `pixels_by_label`; a run whose label is 0 is left out. The run is from pixel
+    ``first`` to before ``end``.
     """
     if label > 0:
         runs[n, 0], runs[n, 1], runs[n, 2] = label, first, end
@@ -45,5 +46,8 @@ def pixels_by_label(runs: I4, labels: int) -> tuple[U4, I4]:
 
 
 def split_by_label(order: U4, ends: I4) -> list[U4]:
-    """Split the result of `pixels_by_label` into a list (k,) of pixels for each label from 1."""
+    """Split the result of `pixels_by_label` into a list (k,) of pixels for each label from 1.
+
+    ``order`` (n,) are the pixel indices, ``ends`` (labels,) where each label ends.
+    """
     return [order[a:b] for a, b in pairwise(ends.tolist())]

@@ -97,7 +97,12 @@ def _select_objects(
     *,
     image: bool,
 ) -> list[int]:
-    """Return which lists in ``indices`` have enough points, in the order of their first points."""
+    """Return which lists in ``indices`` have enough points, in the order of their first points.
+
+    ``indices`` are the pixels or points of each label; ``image`` says whether they are pixels.
+    Those of an object are at least ``min_points`` and, in an image, cover
+    `ObjectMeasurements.min_cells`.
+    """
     limits = [float(min_points)] * len(indices)
     if image:
         limits = [max(min_points, n * grid.factor**2) for n in measured.min_cells.tolist()]
@@ -118,7 +123,10 @@ def _has_object_size(box: Box, settings: DetectionSettings) -> bool:
 def _boxes(
     segmentation: Segmentation, indices: Sequence[U4], points: F4 | None, sensor_from_view: Pose
 ) -> list[Box]:
-    """Return the boxes of all lists: measured on cells, or on points for hidden objects."""
+    """Return the boxes of all lists: measured on cells, or on points for hidden objects.
+
+    ``indices`` and ``points`` are as in `build_scene`. The boxes are in the sensor frame.
+    """
     measured = segmentation.measured.boxes
     sizes = [measured.center, measured.size, measured.orientation]
     if sensor_from_view is IDENTITY:  # rows of a frozen array are frozen
@@ -174,7 +182,11 @@ def _at_view_border(grid: DepthGrid, segmentation: Segmentation, sensor_from_vie
 
 
 def _ends(valid: Bool, last: int) -> tuple[I4, I4]:
-    """Return the first and last row with depth in each column; each column must have one."""
+    """Return the first and last row with depth in each column; each column must have one.
+
+    ``valid`` (rows, columns) is where depth is; ``last`` is the last row. The results are
+    (columns,).
+    """
     return np.argmax(valid, axis=0), last - np.argmax(valid[::-1], axis=0)
 
 
@@ -187,6 +199,7 @@ def _transform_box(sensor_from_view: Pose, box: Box) -> Box:
 
 
 def _plane(plane: Row, lowest: float, sensor_from_view: Pose) -> Plane:
+    """Return a `PLANE` in the sensor frame; ``lowest`` is the lowest plane's offset, metres."""
     normal, offset = plane["up"], float(plane["offset"])
     outline = outline_corners(normal, offset, plane["extent"])
     if sensor_from_view is not IDENTITY:

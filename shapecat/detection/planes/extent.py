@@ -118,10 +118,11 @@ def _ends(inliers: DepthSamples, rows: int, columns: int) -> I4:
 
 @kernel(inline=True)
 def _extent_of(grid: DepthGrid, plane: F8, normal: F8, ends: I4) -> F8:
-    """Return the `SupportingPlane.extent` of a plane, with a margin.
+    """Return the `SupportingPlane.extent` of a plane, enlarged by `PLANES.margin_m`.
 
-    A convex outline is convex in the image too: it follows from the first and last inlier of each
-    row, and their neighbours on the plane.
+    Perspective keeps a convex outline convex, so only the ends of each row are used, and cells
+    `APART` cells from them if they lie on the plane. ``plane`` (3,) is a, b, c of its inverse
+    depth; ``normal`` (3,) is in the sensor frame; ``ends`` (2, rows) are from `_ends`.
     """
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     rows, columns = inv_depth.shape
@@ -161,7 +162,7 @@ def level_coordinates(grid: DepthGrid, mask: Bool, up: F8) -> F8:
 def outline_corners(up: F8, offset: float, extent: F8) -> F8:
     """Return the corners (DIRECTIONS, 3) of the convex outline in order, metres, sensor frame.
 
-    The parameters are as in `SupportingPlane`.
+    The parameters are as in `SupportingPlane`. ``up`` and ``extent`` are (3,) and (DIRECTIONS,).
     """
     # Neighbouring sides x cos + y sin = extent meet at a corner.
     along = (np.roll(extent, -1) - extent * COS[1]) / SIN[1]

@@ -100,9 +100,10 @@ def _assign(
 ) -> None:
     """Assign the cells inside the outline of a plane that have no plane yet; loops vectorise.
 
-    ``plane`` is a `PLANE`, numbered from 1; ``max_height_m`` is the maximum height above it,
-    metres. The kernel is compiled without ``fast``: with it, the inlined copy would round heights
-    differently in the process that compiles it and in later ones.
+    ``plane`` is a `PLANE`; ``number`` is its number, from 1, in `HeightMap.plane_id`;
+    ``max_height_m`` is the maximum height above it, metres. The kernel is compiled without
+    ``fast``: with it, the inlined copy would round heights differently in the process that compiles
+    it and in later ones.
     """
     inv_depth, intrinsics, (plane_id, height) = grid.inverse_depth, grid.intrinsics, heights
     rows, columns = inv_depth.shape
@@ -166,7 +167,11 @@ def _assign(
 def _bounds(
     line: F4, inv_depth: F4, i: int
 ) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Return the first and last cell of row i with a height, and bounds of their inverse depth."""
+    """Return the first and last cell of row i with a height, and bounds of their inverse depth.
+
+    ``line`` (columns,) are the heights of the row, `OUT` where there is none; the bounds are the
+    least and the greatest inverse depth, 1/m.
+    """
     left, right = 0, line.size - 1
     while line[left] <= OUT:
         left += 1

@@ -61,6 +61,7 @@ def find_horizontal_planes(
 def _measure_candidates(
     grid: DepthGrid, samples: DepthSamples, planes: Iterable[F8]
 ) -> list[PlaneCandidate]:
+    """Measure planes (a, b, c) on their inliers; leave out planes of little visible area."""
     candidates = (measure_candidate(grid, samples, plane) for plane in planes)
     return [candidate for candidate in candidates if candidate.plane.area_m2 >= PLANES.min_area_m2]
 
@@ -77,7 +78,11 @@ def _common_up(candidates: list[PlaneCandidate]) -> F8:
 
 @kernel(fast=True)
 def _refit_parallel(intrinsics: PinholeIntrinsics, inliers: DepthSamples, up: F8) -> F8:
-    """Fit a plane with the normal ``up`` to the inliers of another plane, by least squares."""
+    """Fit a plane with the normal ``up`` to the inliers of another plane, by least squares.
+
+    Returns a, b, c (3,) of its inverse depth, as `horizontal_plane` does. ``up`` is a unit vector
+    (3,), sensor frame.
+    """
     # The inverse depth of the plane up @ p == offset is along / offset.
     squares = products = 0.0
     for k in range(inliers.inverse_depth.size):
@@ -140,7 +145,7 @@ def _fit(
 ) -> tuple[F8, bool]:
     """Fit a plane (3,) to samples at about one height; return it, and whether it is large enough.
 
-    ``offset`` is that height above the sensor, metres.
+    ``offset`` is that height above the sensor, metres; ``up`` and ``trials`` are as in `fit_peaks`.
     """
     level = horizontal_plane(intrinsics, up, offset)
     plane = level.copy()

@@ -49,7 +49,11 @@ def orient_points(grid: DepthGrid) -> OrientedPoints:
 def _orient(
     coarse: F4, intrinsics: PinholeIntrinsics, jump: float, normals: F4, positions: F4
 ) -> int:
-    """Write the normals and positions; return the number of points on smooth surface."""
+    """Write the normals and positions; return the number of points on smooth surface.
+
+    ``coarse`` is every third row and column of the inverse depth; ``jump`` separates two surfaces,
+    1/m. ``normals`` and ``positions`` (3, n) are as in `OrientedPoints`.
+    """
     rows, columns = coarse.shape
     x = np.zeros(columns, np.float32)
     for c in range(columns):
@@ -75,7 +79,9 @@ def _orient_row(
 ) -> int:
     """Write the points of a row; return the number on smooth surface. The loop vectorises.
 
-    ``bend`` is the largest second difference of the inverse depth on a smooth surface, 1/m.
+    ``bend`` is the largest second difference of the inverse depth on a smooth surface, 1/m. The row
+    is ``r`` of ``coarse``; its rays are (``x`` (columns,), ``y``, 1); ``focal`` is fx and fy.
+    ``normals`` and ``positions`` are as in `_orient`.
     """
     zero, one, two = np.float32(0), np.float32(1), np.float32(2)
     count = np.int32(0)

@@ -59,7 +59,7 @@ def plane_normal(plane: F8, intrinsics: PinholeIntrinsics) -> F8:
 
 @kernel(inner=True)
 def dot(a: F8, b: F8) -> float:
-    """Return the dot product of two vectors (3,)."""
+    """Return the dot product of two vectors ``a`` and ``b`` (3,)."""
     return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 

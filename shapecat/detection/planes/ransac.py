@@ -31,7 +31,10 @@ SAMPLE = 4800
 
 @kernel
 def sample_grid(inv_depth: F4, mask: F4) -> DepthSamples:
-    """Return evenly spaced samples where ``mask`` (rows, columns) is above 0."""
+    """Return evenly spaced samples with depth where ``mask`` (rows, columns) is above 0.
+
+    ``inv_depth`` is (rows, columns), 1/m.
+    """
     rows, columns = inv_depth.shape
     stride = max(1, round(math.sqrt(inv_depth.size / SAMPLE)))
     result = np.zeros((3, (rows // stride + 1) * (columns // stride + 1)), np.float32)
@@ -116,7 +119,10 @@ def ransac_plane(
 
 @kernel(inline=True)
 def _propose(samples: DepthSamples, trials: F8, t: int, plane: F8) -> bool:
-    """Write the plane through the samples of trial t; return whether they are far enough apart."""
+    """Write the plane through the samples of trial t; return whether they are far enough apart.
+
+    ``plane`` (3,) is a, b, c of inverse depth; ``trials`` are from `draw_trials`.
+    """
     n = samples.inverse_depth.size
     p, q, r = int(trials[t, 0] * n), int(trials[t, 1] * n), int(trials[t, 2] * n)
     j, i, w = samples.j[p], samples.i[p], samples.inverse_depth[p]
@@ -137,7 +143,10 @@ def count_inliers(samples: DepthSamples, plane: F8, tolerance: float) -> int:
 
 @kernel(fast=True)
 def _count_part(samples: DepthSamples, plane: F8, tolerance: float, start: int, stop: int) -> int:
-    """Count the inliers of a plane among the samples from ``start`` to before ``stop``."""
+    """Count the inliers of a plane among the samples from ``start`` to before ``stop``.
+
+    ``plane`` (3,) and ``tolerance`` are as in `count_inliers`.
+    """
     j, i, inv_depth = samples.j, samples.i, samples.inverse_depth
     a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     gate, total = np.float32(tolerance), np.int32(0)

@@ -55,8 +55,8 @@ def _may_be_strips(
 ) -> bool:
     """Return whether a plane at a height is seen at a grazing angle, or covered by objects.
 
-    ``above`` is the level area just above the plane, relative to the area of the plane, as
-    `_peaks` yields it.
+    ``height`` is above the sensor, metres; ``above`` is the level area just above the plane,
+    relative to the area of the plane, as `_peaks` yields it. ``candidates`` are parallel planes.
     """
     large = [plane.offset for plane, *_ in candidates if plane.area_m2 > PLANES.likely_m2]
     up = candidates[0].plane.up
@@ -108,13 +108,18 @@ def _is_at_range_end(inv_depth: F4, strips: DepthSamples) -> bool:
 
 
 def _widened(candidate: PlaneCandidate, table: PlaneCandidate) -> PlaneCandidate:
+    """Return ``candidate``, extended to cover ``table`` as well, with its covered area."""
     extent = np.maximum(candidate.plane.extent, table.plane.extent)
     plane = candidate.plane._replace(extent=extent)
     return candidate._replace(plane=plane, covered_m2=table.covered_m2)
 
 
 def _plane_at(grid: DepthGrid, strips: F4, up: F8, height: float) -> PlaneCandidate:
-    """Measure the level plane through the strips at a height."""
+    """Measure the level plane through the strips at a height.
+
+    ``strips`` (4, n) are from `_level_strips`; ``up`` (3,) is a unit vector; ``height`` is above
+    the sensor, metres.
+    """
     near = np.ascontiguousarray(strips[:, abs(strips[3] - height) < 1.5 * STRIPS.bin_m])
     offset = float(np.median(near[3])) if near.size else height
     samples = DepthSamples(near[0], near[1], near[2], COLUMN_STRIDE)
@@ -124,7 +129,10 @@ def _plane_at(grid: DepthGrid, strips: F4, up: F8, height: float) -> PlaneCandid
 def _covered(
     candidate: PlaneCandidate, strips: F4, intrinsics: PinholeIntrinsics
 ) -> PlaneCandidate:
-    """Return the candidate with its covered area, which is 0 if most of the outline is visible."""
+    """Return the candidate with its covered area, which is 0 if most of the outline is visible.
+
+    ``strips`` (4, n) are from `_level_strips`.
+    """
     plane = candidate.plane
     corners = outline_corners(plane.up, plane.offset, plane.extent)
     area_vector = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
@@ -136,7 +144,11 @@ def _covered(
 
 
 def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane) -> float:
-    """Return the area of level surface inside the outline of a plane and just above it, m²."""
+    """Return the area, m², of the level surfaces above a plane and within its outline.
+
+    They are `STRIPS.same_m` to `STRIPS.tallest_m` above it. ``strips`` (4, n) are from
+    `_level_strips`.
+    """
     subset = strips[:, ::AREA_STRIDE]
     above = subset[3] - plane.offset
     tops = subset[:, (above > STRIPS.same_m) & (above < STRIPS.tallest_m)]
@@ -176,7 +188,10 @@ def _peaks(amount: F8, threshold: float) -> Iterator[tuple[float, float]]:
 
 @kernel
 def _count_by_height(points: OrientedPoints, up: F8) -> F8:
-    """Count the points at each height, (BINS,) lowest first, except those that face sideways."""
+    """Count the points at each height, (BINS,) lowest first, except those that face sideways.
+
+    ``up`` (3,) is a unit vector, sensor frame.
+    """
     x, y, z = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
     xs, ys, zs = points.positions[0], points.positions[1], points.positions[2]
     nx, ny, nz = points.normals[0], points.normals[1], points.normals[2]
@@ -192,7 +207,7 @@ def _count_by_height(points: OrientedPoints, up: F8) -> F8:
 
 @kernel
 def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple[F4, F8]:
-    """Find the samples on level surfaces.
+    """Find the samples on level surfaces in ``inv_depth`` (rows, columns); ``up`` (3,) is vertical.
 
     At least three of the four neighbours of such a sample are closer to a level surface through it
     than to a vertical one. Returns the columns, rows, inverse depths and heights (4, n) of the
@@ -219,7 +234,11 @@ def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple
 
 @kernel(fast=True, inner=True)
 def _find_level(inv_depth: F4, i: int, slope: tuple[float, float, float], level: Bool) -> None:
-    """Mark the cells of row i that are on level surface; the loop vectorises."""
+    """Mark the cells of row i that are on level surface; the loop vectorises.
+
+    ``slope`` is the rise, along up, of the row's rays at depth 1: in column 0, and its change per
+    column and per row. ``level`` (columns,) is written.
+    """
     start, across, down = slope
     steep = np.float32(0.5 * ARM) * np.sqrt(across * across + down * down)
     side, along = np.float32(ARM) * across, np.float32(ARM) * down

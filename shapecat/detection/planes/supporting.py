@@ -92,7 +92,11 @@ def supporting_planes(
 def _is_top(
     grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane, drop: float, area_m2: float
 ) -> bool:
-    """Return whether a plane is the top of an object or of several, by rules 6 to 9."""
+    """Return whether a plane is the top of an object or of several, by rules 6 to 9.
+
+    ``drop`` is the height above the next plane below, metres, infinite if there is none;
+    ``area_m2`` counts the covered area too.
+    """
     furniture = area_m2 >= PLANES.furniture_m2
     on_wall, beyond = _count_below_edge(grid, inliers, plane, drop)
     if on_wall + beyond >= MIN_BELOW:
@@ -207,7 +211,10 @@ def _is_enclosed(grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane)
 def _count_below_edge(
     grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane, drop: float
 ) -> tuple[int, int]:
-    """Count the samples below the edge of a plane that are on a wall, and those farther away."""
+    """Count the samples below the edge of a plane that are on a wall, and those farther away.
+
+    ``drop`` is the height above the next plane below, metres.
+    """
     on_wall = beyond = 0
     for k in range(inliers.inverse_depth.size):
         i, j = inliers.i[k], inliers.j[k]
@@ -246,7 +253,10 @@ def _blurred_steps(fx: float, plane: SupportingPlane, x: float, y: float, z: flo
 def _front_edge(
     grid: DepthGrid, plane: SupportingPlane, i: float, j: float, z: float
 ) -> tuple[float, float, float]:
-    """Follow a plane towards the camera; return its edge, metres, or zeros if none is found."""
+    """Follow a plane towards the camera; return its edge, metres, or zeros if none is found.
+
+    The start is cell (i, j) at depth ``z``, metres; the edge is x, y, z in the sensor frame.
+    """
     k, up = grid.intrinsics, plane.up
     x, y = back_project(k, i, j, z)
     h = x * up[0] + y * up[1] + z * up[2]
@@ -271,7 +281,10 @@ def _front_edge(
 def _inverse_depth_at(
     inv_depth: F4, intrinsics: PinholeIntrinsics, x: float, y: float, z: float
 ) -> float:
-    """Return the inverse depth of the cell that shows a point; -1 outside the image."""
+    """Return the inverse depth of the cell that shows a point, 1/m; -1 outside the image.
+
+    ``inv_depth`` is (rows, columns); ``x``, ``y``, ``z`` are the point, metres, sensor frame.
+    """
     if z <= NEAREST_M:
         return -1.0
     v, u = project(intrinsics, x, y, z)

@@ -94,7 +94,11 @@ def _bins_of(surface: F4) -> int:
 
 @kernel(inline=True)
 def _directions(normals: F4, min_count: float, trials: F8) -> F8:
-    """Return directions (n, 3) that many normals share, the most common first, by RANSAC."""
+    """Return directions (n, 3) that many normals share, the most common first, by RANSAC.
+
+    ``normals`` (3, n) are unit vectors; at least ``min_count`` must share a direction. ``trials``
+    are from `draw_trials`.
+    """
     directions = np.zeros((MAX_DIRECTIONS, 3))
     for k in range(MAX_DIRECTIONS):
         if (
@@ -108,7 +112,10 @@ def _directions(normals: F4, min_count: float, trials: F8) -> F8:
 
 @kernel(inner=True)
 def _select(normals: F4, direction: F8, bounds: tuple[float, float]) -> F4:
-    """Return the normals (3, n) whose cosine with a direction is within bounds."""
+    """Return the normals (3, n) whose cosine with a direction is within bounds.
+
+    ``direction`` (3,) is a unit vector; the cosine is above the lower bound, and at most the upper.
+    """
     selected = np.zeros(normals.shape, np.float32)
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     n = 0
@@ -122,7 +129,10 @@ def _select(normals: F4, direction: F8, bounds: tuple[float, float]) -> F4:
 
 @kernel(inline=True)
 def _ransac_direction(normals: F4, trials: F8, best: F8) -> int:
-    """Write the direction near which most normals (3, n) are; return their number."""
+    """Write the direction near which most normals (3, n) are to ``best`` (3,); return their number.
+
+    ``trials`` are from `draw_trials`.
+    """
     n, best_count = normals.shape[1], 0
     direction = np.zeros(3)
     for t in range(UP.trials):
@@ -144,6 +154,7 @@ def _ransac_direction(normals: F4, trials: F8, best: F8) -> int:
 
 @kernel(fast=True, inner=True)
 def _count_facing(normals: F4, direction: F8, start: int, stop: int) -> int:
+    """Count the normals (3, n) near ``direction`` (3,), from ``start`` to before ``stop``."""
     xs, ys, zs = normals[0], normals[1], normals[2]  # unpacked they would not be contiguous
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     min_cos, inliers = np.float32(UP.facing_cos), np.int32(0)
@@ -154,7 +165,10 @@ def _count_facing(normals: F4, direction: F8, start: int, stop: int) -> int:
 
 @kernel(fast=True, inner=True)
 def _turn_to_mean(normals: F4, direction: F8) -> int:
-    """Turn a direction to the mean of the normals near it; return their number."""
+    """Turn a direction to the mean of the normals near it; return their number.
+
+    ``normals`` are (3, n); ``direction`` (3,) is changed in place.
+    """
     xs, ys, zs = normals[0], normals[1], normals[2]
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     min_cos, zero = np.float32(UP.facing_cos), np.float32(0)
@@ -173,7 +187,11 @@ def _turn_to_mean(normals: F4, direction: F8) -> int:
 
 @kernel(inline=True)
 def _hypotheses(directions: F8, corner_cos: float) -> F8:
-    """Return candidates for up (n, 3): the directions found, and perpendiculars to two of them."""
+    """Return candidates for up (n, 3): the directions found, and perpendiculars to two of them.
+
+    ``directions`` are from `_directions`; two of them are perpendicular enough if the absolute
+    value of their cosine is below ``corner_cos``.
+    """
     n = len(directions)
     result = np.zeros((n * n, 3))
     for k in range(len(directions)):
@@ -191,7 +209,10 @@ def _hypotheses(directions: F8, corner_cos: float) -> F8:
 
 @kernel(inline=True)
 def _score(surface: F4, direction: F8, bins: int, roll_penalty: float) -> float:
-    """Return the score of a direction: the weight of large levels, adjusted as in `estimate_up`."""
+    """Return the score of a direction: the weight of large levels, adjusted as in `estimate_up`.
+
+    ``surface`` (8, n) is from `_every_second`, ``bins`` from `_bins_of`; ``direction`` is (3,).
+    """
     count, areas, facing, total = _count_levels(surface, direction, bins)
     level, squares, area = _large_levels(count, areas, UP.min_share * total)
     if level == 0:
@@ -262,7 +283,8 @@ def _refined(
 ) -> F8:
     """Return the normal (3,) of the largest plane that faces ``direction``, by least squares.
 
-    If the fit turns it away by more than 20 degrees, return ``direction``.
+    If the fit turns it away by more than 20 degrees, return ``direction``. ``surface`` and ``bins``
+    are as in `_score`.
     """
     count, _, _, _ = _count_levels(surface, direction, bins)
     plane = horizontal_plane(intrinsics, direction, -(np.argmax(count) + 0.5) * UP.level_bin_m)

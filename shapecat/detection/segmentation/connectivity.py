@@ -69,6 +69,7 @@ def _blank(spans: I4, columns: int) -> F4:
     """Return arrays (2, rows, 3, columns) for local planes and normals.
 
     The inverse depth of the local planes is 0 in and near object cells; the rest is uninitialised.
+    ``spans`` (rows, 2) are as in `SurfaceGraph`.
     """
     rows = len(spans)
     fits: F4 = unset((2, rows, 3, columns), np.float32)
@@ -84,7 +85,11 @@ def _blank(spans: I4, columns: int) -> F4:
 
 @kernel
 def _link(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, links: U1) -> None:
-    """Link neighbours if their depths are similar, or if one lies on the other's local plane."""
+    """Link neighbours if their depths are similar, or if one lies on the other's local plane.
+
+    ``plane_id`` is as in `HeightMap`; ``spans``, ``local_plane`` and ``links``, which is written,
+    are as in `SurfaceGraph`.
+    """
     inv_depth, jump = grid.inverse_depth, np.float32(grid.discontinuity)
     rows, columns = inv_depth.shape
     depths, plane_ids = inv_depth.reshape(-1), plane_id.reshape(-1)
@@ -109,7 +114,8 @@ def _part_steps(grid: DepthGrid, plane_id: I4, i: int, start: int, end: int, lin
     At a step the depths change more from one cell to the next than before and after it. A plane
     fitted to a window that spans the step treats it as a slope, so that a plate would be linked
     with the can it stands on. At the edge of a surface seen at a grazing angle, only one side has
-    the slope.
+    the slope. The object cells of row ``i`` are from column ``start`` to before ``end``;
+    ``plane_id`` is as in `HeightMap`, ``links`` as in `SurfaceGraph`.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     any_bent = False
@@ -152,7 +158,8 @@ def _link_run(
 
     Parameters
     ----------
-    jump : step in inverse depth that separates two surfaces, 1/m.
+    plane_id, inv_depth, planes, links : the arrays of `_link`, flattened. jump : step in inverse
+        depth that separates two surfaces, 1/m.
     run : the index of its first cell, the index of that cell's local plane, and the number of
         cells.
     steps : index offsets from a cell to its neighbour, from its local plane to the neighbour's, and
@@ -271,7 +278,11 @@ def _raise_concavity(
 
 @kernel(fast=True, inner=True)
 def _write_angles(level: F4, worst: F4, concavity: U1) -> None:
-    """Write the angles of squared chords, in degrees; 0 for cells without a local plane."""
+    """Write the angles of squared chords, in degrees; 0 for cells without a local plane.
+
+    All arrays are of the object cells of a row (n,): ``level``, the inverse depth of the local
+    planes; ``worst``, the squared chords from `_raise_concavity`; ``concavity``, which is written.
+    """
     degrees, max_angle = np.float32(180 / math.pi), np.float32(120)
     for k in range(concavity.size):
         half = np.sqrt(worst[k]) * np.float32(0.5)

@@ -59,7 +59,7 @@ def fit_local_planes(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, 
 
 @kernel(inner=True)
 def padded(start: int, end: int) -> int:
-    """Return the end of a run that is padded to a multiple of `LANES` cells."""
+    """Return the end of a run from ``start`` to ``end``, padded to a multiple of `LANES` cells."""
     return start + (end - start + LANES - 1) // LANES * LANES
 
 
@@ -67,7 +67,8 @@ def padded(start: int, end: int) -> int:
 def _write(fits: F4, planes: F4, normals: F4, start: int, columns: int, n: int) -> None:
     """Copy the fits of a run to the local planes and normals, beginning at index ``start``.
 
-    Slices and signed indices would be slower.
+    ``fits`` is from `_fit_run` for ``n`` cells; ``planes`` and ``normals`` are as in
+    `fit_local_planes`, flattened. Slices and signed indices would be slower.
     """
     for d in range(3):
         target, plane = np.uint64(start + d * columns), np.uint64(d * PITCH)
@@ -82,8 +83,8 @@ def _write(fits: F4, planes: F4, normals: F4, start: int, columns: int, n: int) 
 def _next_run(plane_ids: I4, row: int, j: int, last: int) -> tuple[int, int]:
     """Return the first column, and one past the last, of the next run of cells above one plane.
 
-    The search begins at column ``j``. There must be an object cell before ``last``; ``row`` is the
-    index of the first cell of the row.
+    The search begins at column ``j``. ``plane_ids`` are as in `HeightMap`, flattened. There must be
+    an object cell before ``last``; ``row`` is the index of the first cell of the row.
     """
     while plane_ids[row + j] <= 0:
         j += 1
@@ -104,7 +105,9 @@ def _copy_windows(
     """Copy the rows around a run, and `WINDOW` cells beyond its ends, to ``values``.
 
     Writes `NONE` for cells above other planes. ``run`` is the row of the run, its first column, and
-    one past its last.
+    one past its last. ``depths`` and ``plane_ids`` (rows * columns,) are inverse depth and
+    `HeightMap.plane_id`, flattened from ``shape``; ``values`` (SIDE * PITCH,) holds one row after
+    the other.
     """
     rows, columns = shape
     i, start, end = run
@@ -127,8 +130,9 @@ def _fit_run(
 ) -> None:
     """Fit planes to the windows of ``n`` cells, beginning at (i, ``start``).
 
-    ``wider`` multiplies the gates of `SEGMENTATION`. The rows of ``fits`` are inverse depth, its
-    change per column and per row, and the normal (3); 0 where there is no fit.
+    ``wider`` multiplies the gates of `SEGMENTATION`. ``values`` (SIDE * PITCH,) are from
+    `_copy_windows`. ``fits`` (6 * PITCH,), written in place, holds blocks of `PITCH`: inverse
+    depth, its change per column and per row, and the normal x, y, z; 0 where there is no fit.
     """
     zero, one = np.float32(0), np.float32(1)
     g0, slope = wider * np.float32(SEGMENTATION.gate), wider * np.float32(SEGMENTATION.gate_slope)
@@ -178,7 +182,10 @@ def _fit_run(
 
 @kernel(fast=True, inner=True)
 def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> Any:
-    """Return the sum of the values of rows -3, -2, -1, 1, 2 and 3, each times its row number."""
+    """Return the sum of the values of rows -3, -2, -1, 1, 2 and 3, each times its row number.
+
+    The parameters ``a`` to ``g`` are the values in this order.
+    """
     return np.float32(3) * (g - a) + np.float32(2) * (f - b) + (e - c)
 
 
@@ -186,7 +193,11 @@ def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> An
 def _four(
     values: F4, p: int, center: float, outer_gate: float, inner_gate: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the sums of 1, x, x x, v, x v over the samples at columns -3, -1, 1, 3 from ``p``."""
+    """Return the sums of 1, x, x x, v, x v over the samples at columns -3, -1, 1, 3 from ``p``.
+
+    Here v is the difference from ``center``. ``values`` are from `_copy_windows`; the gates of the
+    outer and the inner samples are as in `_sample`.
+    """
     a, va = _sample(values, p - 3, center, outer_gate)
     b, vb = _sample(values, p - 1, center, inner_gate)
     c, vc = _sample(values, p + 1, center, inner_gate)
@@ -200,7 +211,10 @@ def _four(
 def _three(
     values: F4, p: int, center: float, outer_gate: float, inner_gate: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the sums of 1, x, x x, v, x v over the samples at columns -2, 0, 2 from ``p``."""
+    """Return the sums of 1, x, x x, v, x v over the samples at columns -2, 0, 2 from ``p``.
+
+    The parameters are as in `_four`; the inner gate is for column 0.
+    """
     a, va = _sample(values, p - 2, center, outer_gate)
     b, vb = _sample(values, p, center, inner_gate)
     c, vc = _sample(values, p + 2, center, outer_gate)
@@ -210,7 +224,11 @@ def _three(
 
 @kernel(fast=True, inner=True)
 def _sample(values: F4, p: int, center: float, gate: float) -> tuple[Any, Any]:
-    """Return the weight of a sample, 0 or 1, and its weighted difference from the centre."""
+    """Return the weight of a sample, 0 or 1, and its weighted difference from the centre.
+
+    ``values`` are from `_copy_windows`, ``p`` is an index in them; the weight is 1 if the
+    difference from ``center`` is below ``gate``, 1/m.
+    """
     v = values[p] - center
     weight = np.float32(1) if abs(v) < gate else np.float32(0)
     return weight, weight * v

@@ -44,7 +44,8 @@ def watershed(
 def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n: int) -> int:
     """Label connected parts of unlabelled cells with angles below ``edge_deg``, from ``n`` + 1.
 
-    Small parts stay unlabelled. Returns the last label.
+    Small parts stay unlabelled. Returns the last label. ``plane_id`` is as in `HeightMap`;
+    ``labels`` (rows, columns), 0 where unlabelled, is changed in place.
     """
     inside: Bool = np.zeros(labels.shape, np.bool_)
     concavity, spans, threshold = graph.concavity, graph.spans, np.uint8(edge_deg)
@@ -86,10 +87,11 @@ def _min_size(sizes: I4, n: int) -> tuple[int, int]:
 
 @kernel
 def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4) -> None:
-    """Grow the labels along links, cells with small concave angles first.
+    """Grow labels (rows, columns) along links, in place, over flat cells first.
 
-    There is a queue for each range of angles, as a linked list: ``following`` holds the successor
-    of each cell, -1 for the last one. The heads of the queues come after the cells.
+    Flat cells have small concave angles. There is a queue for each range of angles, as a linked
+    list: ``following`` holds the successor of each cell, -1 for the last one. The heads of the
+    queues come after the cells. The other parameters are as in `SurfaceGraph`.
     """
     columns, size = labels.shape[1], labels.size
     angle, flat = concavity.reshape(-1), labels.reshape(-1)
@@ -120,7 +122,9 @@ def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4) -> None:
 def _find_directions(links: U1, labels: I4, spans: I4, columns: int, directions: U1) -> None:
     """Write bits for the directions in which each cell (n,) is linked with an unlabelled one.
 
-    The loops vectorise, because unsigned indices need no check for negative values.
+    ``links`` and ``labels`` are flattened, ``spans`` as in `SurfaceGraph`; the bits are `RIGHT`,
+    `DOWN`, `LEFT` and `UP`. The loops vectorise, because unsigned indices need no check for
+    negative values.
     """
     one, below = np.uint64(1), np.uint64(columns)
     right, down, left, up = np.uint8(RIGHT), np.uint8(DOWN), np.uint8(LEFT), np.uint8(UP)

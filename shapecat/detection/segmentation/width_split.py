@@ -69,7 +69,7 @@ def split_at_width_changes(
 def _relabel_above(
     labels: I4, spans: I4, height: F4, label: int, level: float, new_label: int
 ) -> None:
-    """Give the cells of a label that are higher than ``level``, metres, a new label, in place.
+    """Give the cells of a label that are higher than ``level``, metres, ``new_label``, in place.
 
     ``labels`` (rows, columns) are 0 outside ``spans``; ``height`` (rows, columns) is in metres.
     """
@@ -81,7 +81,11 @@ def _relabel_above(
 
 @kernel(inline=True)
 def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, side: F8) -> Outlines:
-    """Collect the outlines of the labels 1..n."""
+    """Collect the outlines of the labels 1..n.
+
+    ``height`` is as in `HeightMap`, ``spans`` as in `SurfaceGraph`; ``side`` (3,) is the
+    `lateral_axis`.
+    """
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     one, per_band = np.float32(1), np.float32(1 / BAND_M)
     # Lateral position over depth is linear in column and row.
@@ -107,7 +111,7 @@ def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, sid
 
 @kernel(inline=True)
 def _find_cuts(outlines: Outlines, p: int, cuts: Bool) -> bool:
-    """Mark the bands (BANDS,) below which label ``p`` is cut; return whether there are any."""
+    """Mark in ``cuts`` (BANDS,) the bands below which label ``p`` is cut; return whether any is."""
     first, last, band_count, above = 0, 0, 0, 0
     for band in range(BANDS):
         cells = outlines.counts[p, band]
@@ -137,7 +141,7 @@ def _find_cuts(outlines: Outlines, p: int, cuts: Bool) -> bool:
 
 @kernel(inline=True)
 def _step_at(outlines: Outlines, p: int, band: int) -> float:
-    """Return by how much both sides together step at the lower edge of a band, metres.
+    """Return by how much both sides of label p together step at the lower edge of a band, metres.
 
     The result is 0 unless one side steps by at least `SegmentationSettings.side_step_m`.
     """
@@ -163,12 +167,18 @@ def _step_at(outlines: Outlines, p: int, band: int) -> float:
 
 @kernel(inner=True)
 def _second(end: F4, k: int, sign: float) -> float:
-    """Return the second largest of ``sign * end[k : k + 4]``: a spur one band high is noise."""
+    """Return the second largest of ``sign * end[k : k + 4]``: a spur one band high is noise.
+
+    ``end`` (BANDS,) is a row of `Outlines.ends`.
+    """
     a, b, c, d = sign * end[k], sign * end[k + 1], sign * end[k + 2], sign * end[k + 3]
     return float(max(min(max(a, b), max(c, d)), min(a, b), min(c, d)))
 
 
 @kernel(inner=True)
 def _slope_of(end: F4, k: int) -> float:
-    """Return the mean difference of consecutive values, over four values."""
+    """Return the mean difference of consecutive values over the four values from ``end[k]``.
+
+    ``end`` (BANDS,) is a row of `Outlines.ends`.
+    """
     return float((end[k + 3] + end[k + 2] - end[k + 1] - end[k]) / 4)
