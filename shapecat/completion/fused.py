@@ -125,6 +125,7 @@ def fuse_boxes(views: BoxViews, weights: F8, posterior: F8, categories: Sequence
 def _resting(centers: F8, weights: F8) -> int:
     """Return the most central of the views that show the object where it stands longest.
 
+    ``centers`` (k, 3), metres, are those of the views' boxes, ``weights`` (k,) the views' weights.
     Views of a carried object are avoided: the estimate of a box assumes an object on its support.
     """
     distances = np.linalg.norm(centers - _median(centers, weights), axis=1)
@@ -142,7 +143,10 @@ def _near(centers: F8, place: F8) -> Bool:
 
 
 def _not_turned(axes: F8, sizes: F8, weights: F8) -> Bool:
-    """Return in which views (k,) an object that stands in one place has its most common yaw."""
+    """Return in which views (k,) an object that stands in one place has its most common yaw.
+
+    ``axes`` (k, 3, 3) and ``sizes`` (k, 3) are as in `BoxViews`; ``weights`` (k,) are the views'.
+    """
     result = np.ones(len(axes), np.bool_)
     best_weight, elongation = 0.0, _elongation(sizes)
     for k in np.unique(np.linspace(0, len(axes) - 1, _TRIED).astype(np.int64)).tolist():
@@ -165,7 +169,8 @@ def _not_turned(axes: F8, sizes: F8, weights: F8) -> Bool:
 def _turned_from(base: F8, elongation: float, axes: F8, sizes: F8) -> Bool:
     """Return in which views (k,) an object has turned from a box with the axes ``base``.
 
-    Neighbouring views must agree, as a single one may err. ``elongation`` is from `_elongation`.
+    Neighbouring views must agree, as a single one may err. ``elongation`` is from `_elongation`;
+    ``axes`` and ``sizes`` are as in `_not_turned`.
     """
     angle, longer, count = _yaws(base, axes), _elongation(sizes), np.ones(len(axes))
     weights = _SQUARE + abs(longer)
@@ -194,7 +199,10 @@ def _elongation(sizes: F8) -> F8:
 
 
 def _mean_axes(axes: F8, sizes: F8, weights: F8) -> F8:
-    """Return the first of the axes (k, 3, 3), turned to the mean yaw of all, modulo 90 degrees."""
+    """Return the first of the axes (k, 3, 3), turned to the mean yaw of all, modulo 90 degrees.
+
+    The parameters are as in `_not_turned`.
+    """
     first = axes[0]
     total = np.sum(weights * (_SQUARE + abs(_elongation(sizes))) * np.exp(4j * _yaws(first, axes)))
     return np.asarray(first @ _about_z(float(np.angle(total)) / 4))
@@ -203,8 +211,8 @@ def _mean_axes(axes: F8, sizes: F8, weights: F8) -> F8:
 def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F8]:
     """Return the median outline about ``origin``, and the fraction of views seeing each direction.
 
-    Both are (96,). The directions begin at the first of the axes ``base``, and turn towards the
-    second.
+    Both are (96,). ``weights`` (k,) are the views'; ``origin`` (3,) is in metres. The directions
+    begin at the first of the axes ``base``, and turn towards the second.
     """
     around = _turned(views.outlines, _yaws(base, views.axes))
     positions = (views.centers - origin) @ base
@@ -239,13 +247,17 @@ def _turned(outlines: F8, angles: F8) -> F8:
 
 
 def _alike(axes: F8, sizes: F8, size: F8) -> F8:
-    """Return axes (k, 3, 3), turned by 90 degrees where the longer side is not that of ``size``."""
+    """Return axes (k, 3, 3), turned by 90 degrees where the longer side is not that of ``size``.
+
+    ``sizes`` (k, 3) are the lengths along these axes, ``size`` (3,) those of the fused box.
+    """
     swapped = (sizes[:, 0] < sizes[:, 1]) != (size[0] < size[1])
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     return np.where(swapped[:, None, None], axes @ quarter, axes)
 
 
 def _about_z(angle: float) -> F8:
+    """Return the rotation (3, 3) about z by an angle, radians."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 

@@ -74,7 +74,10 @@ def support_function(
 
 @kernel(inline=True)
 def _overshoot(x: F4, y: F4, a: float, b: float, top: float, noise: float, flat: float) -> float:
-    """Return how far ``top`` is beyond the mean of its side; reduced if the side is not flat."""
+    """Return how far ``top`` is beyond the mean of its side; reduced if the side is not flat.
+
+    The side is in the direction (``a``, ``b``); the other parameters are as in `support_function`.
+    """
     count, total = 0, 0.0
     for i in range(x.size):
         below = top - (a * x[i] + b * y[i])
@@ -85,7 +88,10 @@ def _overshoot(x: F4, y: F4, a: float, b: float, top: float, noise: float, flat:
 
 @kernel(inline=True)
 def _replace_smallest(ascending: F4, first: int, value: float) -> None:
-    """Insert a value into a list that is sorted from ``first``; the smallest value drops out."""
+    """Insert a value into a list that is sorted from ``first``; the smallest value drops out.
+
+    ``ascending`` (n,) is the list, ``first`` the index of its smallest value.
+    """
     at = first + 1
     while at < ascending.size and ascending[at] < value:
         ascending[at - 1] = ascending[at]

@@ -177,6 +177,10 @@ def footprint(outline: F8, facing: F8, posterior: F8, categories: Sequence[str])
 
 
 def _visible_outline(points: F4, facing: Bool, category: str) -> F8:
+    """Return the `support_function` (96,) of points (n, 3), metres, with the prior of a category.
+
+    ``facing`` (96,) says which directions face the sensor.
+    """
     x, y = np.ascontiguousarray(points[:, :2].T)
     prior = _PRIORS.get(category, _OutlinePrior())
     # Noise is along the rays: less of it lies beyond edges that face no sensor.

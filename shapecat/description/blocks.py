@@ -29,10 +29,12 @@ UP_BINS = 8
 
 
 def _bins(name: str, count: int) -> Iterator[str]:
+    """Yield the names of ``count`` bins."""
     return (f"{name}_{k}" for k in range(count))
 
 
 def _parts(kind: str, parts: int, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of a block: all ``names`` for each of the rings or bands (``kind``)."""
     return tuple(f"{kind}{part}_{name}" for part in range(parts) for name in names)
 
 
@@ -62,6 +64,7 @@ _BLOCK_NAMES: dict[str, tuple[str, ...]] = {
 
 
 def _slices() -> dict[str, slice]:
+    """Return the slice of each block in the descriptor, by name."""
     ends = np.cumsum([len(names) for names in _BLOCK_NAMES.values()]).tolist()
     return {
         block: slice(end - len(names), end)

@@ -63,6 +63,7 @@ def _ratio(a: float, b: float) -> float:
 
 @kernel(fast=True, inner=True)
 def _width(px: F4, py: F4, c: float, s: float) -> float:
+    """Return the width of points (``px``, ``py``), (n,), along the direction (``c``, ``s``)."""
     low = high = c * px[0] + s * py[0]
     for k in range(px.size):
         value = c * px[k] + s * py[k]
@@ -73,7 +74,10 @@ def _width(px: F4, py: F4, c: float, s: float) -> float:
 
 @kernel(inline=True)
 def _sphere(x: F4, y: F4, z: F4, weight: F4) -> tuple[float, float, float]:
-    """Fit a sphere, |p|^2 = 2 c.p + k; return residual / radius, radius and z of the centre."""
+    """Fit a sphere, |p|^2 = 2 c.p + k; return residual / radius, radius and z of the centre.
+
+    ``x``, ``y``, ``z`` are the neurons (k,), ``weight`` (k,) each neuron's fraction of the points.
+    """
     A, solution = np.zeros((4, 4)), np.zeros(4)
     for i in range(x.size):
         w = weight[i]
@@ -142,7 +146,9 @@ def context(
 def _extents(points: F4, height: float, eye: F4, out: F4) -> tuple[float, float, float]:
     """Compare the height with horizontal widths; return three widths.
 
-    They are the largest width, and the widths across and along the line of sight.
+    They are the largest width, and the widths across and along the line of sight. ``points`` (3, n)
+    and ``eye`` (3,) are as in `Surface`; ``height`` is that of the points. Ratios go to ``out``
+    (5,).
     """
     ex, ey = eye[0], eye[1]
     length = np.sqrt(ex * ex + ey * ey)
@@ -169,7 +175,11 @@ def _extents(points: F4, height: float, eye: F4, out: F4) -> tuple[float, float,
 
 @kernel(inline=True)
 def _spreads(x: F4, y: F4, z: F4, weight: F4, normals: F4, out: F4) -> None:
-    """Compare the principal variances of the neurons and of the normals."""
+    """Compare the principal variances of the neurons and of the normals; write to ``out`` (7,).
+
+    ``x``, ``y``, ``z`` and ``weight`` are as in `_sphere`; ``normals`` (3, k) is from
+    `fit_surfaces`.
+    """
     spread, bend = np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(x.size):
         p = (x[i], y[i], z[i])
@@ -190,7 +200,10 @@ def _spreads(x: F4, y: F4, z: F4, weight: F4, normals: F4, out: F4) -> None:
 
 @kernel(inline=True)
 def _harmonics(weight: F4, normals: F4, out: F4) -> None:
-    """Write harmonics of the distribution of the normals over yaw; the fourth is high for boxes."""
+    """Write harmonics of the distribution of the normals over yaw; the fourth is high for boxes.
+
+    ``weight`` (k,) and ``normals`` (3, k) are as in `_spreads`; ``out`` is (3,).
+    """
     total = 1e-6
     c, s = np.zeros(3), np.zeros(3)
     for i in range(weight.size):
@@ -214,7 +227,9 @@ def _harmonics(weight: F4, normals: F4, out: F4) -> None:
 def _facing(level: F8, weight: F4, normals: F4, out: F4) -> None:
     """Write the fractions of the surface that face up, sideways and down.
 
-    Then follow the fractions that face up near the top and near the bottom.
+    Then follow the fractions that face up near the top and near the bottom. ``level`` (k,) is the
+    height of each neuron, 0 at the bottom and 1 at the top; ``weight`` and ``normals`` are as in
+    `_spreads`; ``out`` is (5,).
     """
     for i in range(level.size):
         w, up = weight[i], normals[2, i]
@@ -236,7 +251,11 @@ def _axis(
     normals: F4,
     out: F4,
 ) -> None:
-    """Compare the surface with a surface of revolution about an upright axis."""
+    """Compare the surface with a surface of revolution about an upright axis.
+
+    ``level`` is as in `_facing`, ``height`` is that of the object; the other parameters are as in
+    `_spreads`. Writes to ``out`` (9,).
+    """
     cx, cy, residual = upright
     radius = radius2 = middle = 0.0
     parts = np.zeros((2, 2))  # lower and upper half: weight, weighted radius
@@ -269,7 +288,10 @@ def _axis(
 
 @kernel(inline=True)
 def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
-    """Write mean, deviation and skew of heights ``level`` (n,), and the share of convex surface."""
+    """Write mean, deviation and skew of heights ``level`` (n,), and the share of convex surface.
+
+    ``weight`` (k,) is as in `_sphere`, ``curvatures`` (2, k) from `fit_surfaces`; ``out`` is (4,).
+    """
     mean = second = third = 0.0
     for i in range(level.size):
         mean += weight[i] * level[i]
@@ -285,7 +307,10 @@ def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
 
 @kernel(inline=True)
 def _around(euclidean: F4, geodesic: F4, out: F4) -> None:
-    """Compare distances along the surface with Euclidean distances."""
+    """Compare distances along the surface with Euclidean distances; write to ``out`` (3,).
+
+    Both are (k, k), between the neurons, as in `Surface`.
+    """
     count = geodesic.shape[0]
     total = direct = longest = max_sum = 0.0
     min_sum = np.inf

@@ -137,7 +137,10 @@ def fit_surfaces(
 def _normal(
     u: F4, v: F4, w: F4, n_points: int, ex: float, ey: float, ez: float
 ) -> tuple[float, float, float]:
-    """Return the direction of smallest variance; if that is undefined, (ex, ey, ez) normalised."""
+    """Return the direction of smallest variance; if that is undefined, (ex, ey, ez) normalised.
+
+    ``u``, ``v``, ``w`` (n,) hold the offsets of ``n_points`` points from the neuron, in radii.
+    """
     su = sv = sw = suu = suv = suw = svv = svw = sww = np.float32(0)
     for k in range(n_points):
         a, b, c = u[k], v[k], w[k]
@@ -203,7 +206,8 @@ def _quadric(
 ) -> tuple[float, float, float, float, float]:
     """Return the principal curvatures (largest first) and the normal at the origin.
 
-    Curvature is positive where the surface bends away from the normal (a, b, c).
+    Curvature is positive where the surface bends away from the normal (a, b, c), which is from
+    `_normal`, as ``u``, ``v``, ``w`` and ``n_points`` are there.
     """
     # Tangents without a branch on the direction (Duff et al. 2017).
     sign = 1.0 if c >= 0 else -1.0

@@ -86,9 +86,10 @@ def describe(points: F4, gas: NeuralGas, eye: F4) -> F4:
 
 
 def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> None:
-    """Write the descriptor.
+    """Write the descriptor to ``out`` (d,).
 
-    Each block is a kernel of its own: as one they would take two seconds more to compile.
+    The other parameters are the arrays of `describe` and of its graph. Each block is a kernel of
+    its own: as one they would take two seconds more to compile.
     """
     surface = _prepare(points, neurons, edges, eye)
     cloud, weight, unit = surface.points, surface.weight, surface.unit
@@ -127,6 +128,7 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> None:
 
 @kernel
 def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> Surface:
+    """Return the object in its own units; the parameters are as in `_describe`."""
     rows, euclidean, center, unit = _own_units(neurons)
     x, y, z = rows[0], rows[1], rows[2]
     away = 0.0
@@ -166,7 +168,10 @@ def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> Surface:
 
 @kernel(inline=True)
 def _cloud_of(points: F4, center: F8, unit: float) -> F4:
-    """Return every k-th point (3, n), relative to ``center`` and in units of ``unit``."""
+    """Return every k-th point (3, n), relative to ``center`` and in units of ``unit``.
+
+    ``points`` (m, 3) and ``center`` (3,) are in metres.
+    """
     step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
     total = (points.shape[0] + step - 1) // step
     cloud = np.zeros((3, total), np.float32)
@@ -180,7 +185,7 @@ def _cloud_of(points: F4, center: F8, unit: float) -> F4:
 
 @kernel(inline=True)
 def _nearest_neurons(starts: I4) -> I4:
-    """Return the neuron of each point, for points sorted by `assign`."""
+    """Return the neuron (n,) of each point; points and ``starts`` are from `assign`."""
     owner = np.zeros(starts[-1], np.int64)
     for k in range(starts.size - 1):
         for i in range(starts[k], starts[k + 1]):

@@ -55,6 +55,7 @@ def geodesic_distances(euclidean: F4, edges: U2) -> F4:
 
 @kernel(fast=True, inner=True)
 def _less(a: float, b: float) -> float:
+    """Return the smaller of two numbers, in a form that vectorises."""
     return a if a < b else b
 
 
@@ -62,7 +63,8 @@ def _less(a: float, b: float) -> float:
 def _ways(paths: F4, k: int, via: F4) -> None:
     """Write the path lengths from each of the nodes k to k + 3 to ``via``.
 
-    A path may pass through those of the four nodes that have lower numbers.
+    ``paths`` (n, n) are the lengths so far, ``via`` is (4, n). A path may pass through those of the
+    four nodes that have lower numbers.
     """
     first, second, third, fourth = paths[k], paths[k + 1], paths[k + 2], paths[k + 3]
     a = second[k]
@@ -82,7 +84,10 @@ def _ways(paths: F4, k: int, via: F4) -> None:
 
 @kernel(fast=True, inline=True)
 def _shorten(paths: F4, i: int, via: F4, k: int) -> None:
-    """Route the paths of node i through the nodes k to k + 3 where that is shorter."""
+    """Route the paths of node i through the nodes k to k + 3 where that is shorter.
+
+    ``paths`` (n, n) is changed in place; ``via`` (4, n) is from `_ways`.
+    """
     a = paths[i, k]
     b = _less(paths[i, k + 1], a + via[0, k + 1])
     c = _less(_less(paths[i, k + 2], a + via[0, k + 2]), b + via[1, k + 2])
@@ -97,7 +102,10 @@ def _shorten(paths: F4, i: int, via: F4, k: int) -> None:
 
 @kernel(fast=True, inline=True)
 def _joined(paths: F4, euclidean: F4) -> F4:
-    """Return the paths without padding, and fill in those that do not exist."""
+    """Return the paths (n, n) without padding, and fill in those that do not exist.
+
+    ``euclidean`` (n, n) are the distances of the nodes.
+    """
     count = euclidean.shape[0]
     result = np.zeros((count, count), np.float32)
     longest = np.float32(0)

@@ -34,7 +34,10 @@ _BAND_GEODESIC, _BAND_EUCLIDEAN, _BAND_CURVED = (
 
 @kernel(inner=True)
 def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
-    """Add ``weight`` to a histogram at ``place`` (0 to 1), split between the two nearest bins."""
+    """Add ``weight`` to a histogram at ``place`` (0 to 1), split between the two nearest bins.
+
+    The histogram is ``bins`` elements of ``row`` from ``start`` on.
+    """
     at = min(max(place * bins - 0.5, 0.0), bins - 1.0)
     k = min(int(at), bins - 2)
     row[start + k] += weight * (k + 1 - at)
@@ -45,7 +48,8 @@ def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
 def _find_bins(lengths: F4, i: int, scale: float, one: float, bins: I4, shares: F4) -> None:
     """Write, for each length in row i, the first of its two bins, and the share of the second.
 
-    Shares add up to ``one``; ``scale`` is bins per unit of length.
+    The two shares of a length add up to ``one``; ``scale`` is bins per unit of length. ``lengths``
+    is (n, n); ``bins`` and ``shares`` (n,) are written.
     """
     last = np.float32(DISTANCE_BINS - 1)
     for j in range(lengths.shape[1]):
@@ -111,6 +115,11 @@ def distributions(surface: Surface, normals: F4, curvatures: F4, out: F4) -> Non
 
 @kernel(inline=True)
 def _curvature_row(row: F4, first: float, second: float) -> None:
+    """Write the histograms of one neuron with the principal curvatures ``first`` and ``second``.
+
+    They are shape index, curvedness and mean curvature, after a 1, in the first elements of
+    ``row``.
+    """
     row[0] = 1
     spread = first - second
     index = 2 / np.pi * np.arctan2(first + second, spread)
@@ -136,8 +145,10 @@ def _partition(
 ) -> None:
     """Write the mean of ``rows`` over the neurons in each of ``parts`` equal intervals.
 
-    The intervals divide the range of ``order`` (n,). A neuron counts in the two intervals whose
-    middles are nearest, so that a small change of the graph changes the descriptor little.
+    The intervals divide the range of ``order`` (n,); ``weight`` (n,) is each neuron's fraction of
+    the points. The blocks of geodesic distances, Euclidean distances and curvature begin at the
+    three last indices in the descriptor ``out``. A neuron counts in the two intervals whose middles
+    are nearest, so that a small change of the graph changes the descriptor little.
     """
     low, high = outer_range(order)
     sums = np.zeros((parts, rows.shape[1]))

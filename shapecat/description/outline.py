@@ -61,7 +61,10 @@ def outline(cloud: F4, eye: F4, out: F4) -> None:
 
 @kernel(inline=True)
 def _image(cloud: F4, eye: F4) -> tuple[F4, F4]:
-    """Return the image coordinates (n,) of the points: to the right, and upwards."""
+    """Return the image coordinates (n,) of the points: to the right, and upwards.
+
+    ``cloud`` (3, n) and ``eye`` (3,) are as in `outline`.
+    """
     count = cloud.shape[1]
     across, upward = np.zeros(count, np.float32), np.zeros(count, np.float32)
     distance = max(np.sqrt(np.float64(eye[0]) ** 2 + eye[1] ** 2 + eye[2] ** 2), 1e-6)

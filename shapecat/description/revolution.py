@@ -99,7 +99,7 @@ def fit_axis(neurons: F4, weight: F4, normals: F4, axis: F8, point: F8, free: in
 
 @kernel
 def _across(axis: F8) -> tuple[F8, F8]:
-    """Return two unit vectors that form a right-handed frame with the axis."""
+    """Return two unit vectors (3,) that form a right-handed frame with ``axis`` (3,)."""
     small = 0
     for j in range(1, 3):
         small = j if abs(axis[j]) < abs(axis[small]) else small
@@ -119,8 +119,11 @@ def _place(
 ) -> tuple[F8, F8]:
     """Return cylindrical coordinates (5, n) about the axis, and the range (2,) along it.
 
-    The rows are the position along the axis, the radius, the radial unit vector (2), and a weight,
-    the fourth power of the sine of the angle between normal and axis.
+    ``owner`` (n,) is the neuron of each point of ``cloud`` (3, n), ``normals`` (3, k) are those of
+    the neurons. The axis has the direction ``axis`` and contains ``point``; ``first`` and
+    ``second`` are from `_across`. The rows are the position along the axis, the radius, the radial
+    unit vector (2), and a weight, the fourth power of the sine of the angle between normal and
+    axis.
     """
     rows = np.zeros((5, cloud.shape[1]))
     extent = np.zeros(2)
@@ -142,6 +145,7 @@ def _place(
 
 @kernel
 def _slice(along: float, extent: F8) -> int:
+    """Return the slice at a position ``along`` an axis; ``extent`` (2,) is the whole range."""
     share = (along - extent[0]) / max(extent[1] - extent[0], 1e-6)
     return min(int(share * _REVOLUTION_SLICES), _REVOLUTION_SLICES - 1)
 
@@ -150,7 +154,10 @@ def _slice(along: float, extent: F8) -> int:
 def _improve(
     neurons: F4, weight: F4, normals: F4, axis: F8, point: F8, free: int, limit: float
 ) -> float:
-    """Move the axis by one Gauss-Newton step; return the root mean square residual before it."""
+    """Move the axis by one Gauss-Newton step; return the root mean square residual before it.
+
+    The parameters are as in `fit_axis`; residuals beyond ``limit`` get less weight.
+    """
     first, second = _across(axis)
     owner = np.arange(neurons.shape[1])
     rows, extent = _place(neurons, owner, normals, axis, point, first, second)
@@ -193,7 +200,10 @@ def _improve(
 
 @kernel(inner=True)
 def _derivatives(rows: F8, i: int, out: F8) -> None:
-    """Write 1, the radius, and its derivatives with respect to two shifts and two tilts."""
+    """Write 1, the radius, and its derivatives with respect to two shifts and two tilts.
+
+    The point is column i of ``rows``, from `_place`; ``out`` is (6,).
+    """
     out[0], out[1] = 1.0, rows[1, i]
     out[2], out[3] = -rows[2, i], -rows[3, i]
     out[4], out[5] = -rows[2, i] * rows[0, i], -rows[3, i] * rows[0, i]
@@ -201,7 +211,11 @@ def _derivatives(rows: F8, i: int, out: F8) -> None:
 
 @kernel(inline=True)
 def _move(axis: F8, point: F8, first: F8, second: F8, move: F8, farthest: float) -> None:
-    """Shift the axis by at most ``farthest``, and tilt it by at most 0.3 rad."""
+    """Shift the axis by at most ``farthest``, and tilt it by at most 0.3 rad.
+
+    ``move`` is two shifts and, if it has four elements, two tilts, along ``first`` and ``second``
+    from `_across`. ``axis`` and ``point`` (3,) are changed in place.
+    """
     length = np.sqrt(move[0] ** 2 + move[1] ** 2)
     share = min(1.0, farthest / max(length, 1e-9))
     for j in range(3):
@@ -223,9 +237,10 @@ def _measure(
 ) -> tuple[float, float, float]:
     """Write the profile of all points about an axis, one row of ``slices`` (k, 4) per slice.
 
-    A row is the slice's fraction of all points, the mean radius, the standard deviation from it,
-    and the fraction of its points that face the axis. Returns the root mean square of the
-    deviations in all slices, the length along the axis, and the mean radius.
+    The other parameters are as in `_place`. A row is the slice's fraction of all points, the mean
+    radius, the standard deviation from it, and the fraction of its points that face the axis.
+    Returns the root mean square of the deviations in all slices, the length along the axis, and the
+    mean radius.
     """
     first, second = _across(axis)
     rows, extent = _place(cloud, owner, normals, axis, point, first, second)

@@ -71,6 +71,7 @@ def solids(
 
 @kernel(inner=True)
 def _log_ratio(a: float, b: float) -> float:
+    """Return the logarithm of the ratio of two residuals, bounded where both are small."""
     return float(np.log((a + 1e-3) / (b + 1e-3)))
 
 
@@ -78,8 +79,9 @@ def _log_ratio(a: float, b: float) -> float:
 def _box_frame(cloud: F4, x: F4, y: F4, normals: F4, eye: F4) -> tuple[F4, F4]:
     """Return the points' coordinates (n,) along both horizontal axes of the best upright box.
 
-    Both axes point towards the sensor. The fit minimises the distance from vertical surface to the
-    nearer of the two visible walls (Zhang et al. 2017, "L-shape fitting", the closeness criterion).
+    Both axes point towards the sensor. The parameters are as in `solids`. The fit minimises the
+    distance from vertical surface to the nearer of the two visible walls (Zhang et al. 2017,
+    "L-shape fitting", the closeness criterion).
     """
     u, v = np.zeros(x.size, np.float32), np.zeros(x.size, np.float32)
     start = np.arctan2(eye[1], eye[0])  # so that the result turns with the scene
@@ -111,7 +113,11 @@ def _box_frame(cloud: F4, x: F4, y: F4, normals: F4, eye: F4) -> tuple[F4, F4]:
 
 @kernel(inline=True)
 def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, out: F4) -> None:
-    """Compare the points with the three faces of a box that the sensor can see."""
+    """Compare the points with the three faces of a box that the sensor can see.
+
+    ``u`` and ``v`` (n,) are from `_box_frame`, ``z`` (n,) is the height; the other parameters are
+    as in `solids`. Writes to ``out`` (13,).
+    """
     count = u.size
     low_u, high_u = inner_range(u)
     low_v, high_v = inner_range(v)
@@ -150,7 +156,10 @@ def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, o
 
 @kernel(inline=True)
 def _ball(cloud: F4, low: float, high: float, out: F4) -> None:
-    """Compare the points with the ball fitted to them by least squares."""
+    """Compare the points with the ball fitted to them by least squares.
+
+    The parameters are as in `solids`; ``out`` is (3,).
+    """
     A, b = np.zeros((4, 4)), np.zeros(4)
     row = np.zeros(4)
     row[3] = 1.0

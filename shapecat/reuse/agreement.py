@@ -44,11 +44,13 @@ def agreement(
 
 
 def _numbers(camera: Camera) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy of a camera."""
     return float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy)
 
 
 @kernel
 def _step(count: int) -> int:
+    """Return the step between the points compared, given the number of all points."""
     return max(1, count // _SAMPLES)
 
 
@@ -66,7 +68,9 @@ def _compare(
 
     Parameters
     ----------
-    camera, other_camera : fx, fy, cx, cy, pixels.
+    pixels : (n,) flat indices of the points in ``depth``. depth, other : (h, w) metres, the image
+        with the points and the image to compare with. camera, other_camera : fx, fy, cx, cy,
+        pixels.
     turn, shift : rotation (3, 3) and translation (3,), metres, of ``other_from_one``.
     """
     fx, fy, cx, cy = camera
@@ -102,6 +106,7 @@ def _difference_at(depth: F4, row: int, column: int, expected: float) -> tuple[b
 
     If the pixel itself does not agree, its best neighbour counts: at an edge, the outline may be
     off by a pixel. Outside the image, the result is (True, infinity): nothing agrees there.
+    ``depth`` is (h, w), metres.
     """
     height, width = depth.shape
     if not (0 <= row < height and 0 <= column < width):

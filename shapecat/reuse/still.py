@@ -52,7 +52,10 @@ def _at_rest(pose: Pose | None, other: Pose | None) -> bool:
 
 @kernel
 def _changed(depth: F4, key_depth: F4, range_m: float) -> bool:
-    """Return whether there is a square of pixels whose depths all differ."""
+    """Return whether there is a square of pixels whose depths (h, w) all differ.
+
+    ``depth`` and ``key_depth`` are the two images, metres; ``range_m`` is the range.
+    """
     height, width = depth.shape
     rows = np.zeros(width, np.int64)  # consecutive rows with a long enough run that ends here
     differs = np.zeros(width, np.bool_)
@@ -69,7 +72,10 @@ def _changed(depth: F4, key_depth: F4, range_m: float) -> bool:
 
 @kernel(inline=True)
 def _mark(depth: F4, key_depth: F4, range_m: float, differs: Bool) -> None:
-    """Mark the depths of a row that differ, unless both are out of range."""
+    """Mark the depths of a row that differ, unless both are out of range.
+
+    All arrays are (w,); the marks go to ``differs``. ``range_m`` is the range, metres.
+    """
     for u in range(len(depth)):
         a, b = depth[u], key_depth[u]
         in_range = (a <= range_m) | (b <= range_m)
@@ -80,7 +86,7 @@ def _mark(depth: F4, key_depth: F4, range_m: float, differs: Bool) -> None:
 def _alone(depth: F4, key_depth: F4, row: int, column: int) -> bool:
     """Return whether neither image has the depth of the other at a pixel or beside it.
 
-    If both depths are missing, the result is False.
+    If both depths are missing, the result is False. The images are as in `_changed`.
     """
     a, b = depth[row, column], key_depth[row, column]
     return a != b and not (
@@ -90,7 +96,10 @@ def _alone(depth: F4, key_depth: F4, row: int, column: int) -> bool:
 
 @kernel(inner=True)
 def _finds(depth: F4, row: int, column: int, z: float) -> bool:
-    """Return whether the depth ``z`` occurs at a pixel or beside it."""
+    """Return whether the depth ``z`` occurs at a pixel or beside it.
+
+    ``depth`` is (h, w), metres.
+    """
     height, width = depth.shape
     for v in range(max(row - 1, 0), min(row + 2, height)):
         for u in range(max(column - 1, 0), min(column + 2, width)):

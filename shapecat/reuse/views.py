@@ -146,7 +146,10 @@ def find_repeats(views: Sequence[ObjectView], keys: Sequence[KeyView]) -> list[R
 
 
 def _repeat(view: ObjectView, key: KeyView, moves: dict[int, Move]) -> Repeat | None:
-    """Return the repeat of a view if the points of the object agree as well, else None."""
+    """Return the repeat of a view if the points of the object agree as well, else None.
+
+    ``moves`` holds the motion since each earlier frame, by its number; a missing one is added.
+    """
     earlier = key.view.frame.index
     if earlier not in moves:
         moves[earlier] = _between(key.view, view)
@@ -187,7 +190,7 @@ def _moved_box(move: Move, box: FullBox | None) -> FullBox | None:
 
 
 def _similar(views: Records, keys: Records) -> Bool:
-    """Return which pairs of summaries are alike; the two arrays are broadcast to one shape."""
+    """Return which pairs of summaries are alike; both arrays are broadcast to its shape."""
     ray, key_ray = views["ray_m"], keys["ray_m"]
     distance, key_distance = np.linalg.norm(ray, axis=-1), np.linalg.norm(key_ray, axis=-1)
     area = views["pixels"] * distance**2 / (keys["pixels"] * key_distance**2)

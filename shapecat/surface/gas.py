@@ -84,7 +84,11 @@ def reconstruct(
 
 @kernel
 def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float) -> tuple[F4, U2]:
-    """Grow a gas on points (m, 3) by Algorithm 3 of the thesis."""
+    """Grow a gas on points (m, 3), metres, by Algorithm 3 of the thesis.
+
+    ``neurons``, ``signals`` and ``share`` (``component_share``) are as in `SurfaceSettings`.
+    Returns the neurons (k, 3), metres, and the edges (e, 2).
+    """
     cloud, frame = _normalise(points)
     target = _target_size(cloud, neurons)
     gas = empty_gas(target)
@@ -98,7 +102,10 @@ def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float)
 
 @kernel
 def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U2]:
-    """Grow a gas on points (m, 3) by Algorithm 4 of the thesis."""
+    """Grow a gas on points (m, 3), metres, by Algorithm 4 of the thesis.
+
+    The other parameters and the results are as in `_by_fritzke`.
+    """
     cloud, frame = _normalise(points)
     target = _target_size(cloud, neurons)
     # differs: a bound on the neurons, for memory; and thresholds relative to the object. If a
@@ -147,6 +154,7 @@ def _normalise(points: F4) -> tuple[Cloud, F8]:
 
 @kernel(inner=True)
 def _in_metres(gas: Gas, count: int, frame: F8) -> F4:
+    """Return the first ``count`` neurons, (count, 3) metres; ``frame`` is from `_normalise`."""
     neurons = np.zeros((count, 3), np.float32)
     for i in range(count):
         neurons[i, 0] = gas.x[i] * frame[3] + frame[0]
@@ -157,6 +165,7 @@ def _in_metres(gas: Gas, count: int, frame: F8) -> F4:
 
 @kernel(inner=True)
 def _target_size(cloud: Cloud, neurons: int) -> int:
+    """Return the number of neurons to grow: at most ``neurons``, fewer in a small cloud."""
     max_neurons = max(_FEWEST_NEURONS, int(_NEURONS_PER_POINT * cloud.x.size))
     return max(3, min(neurons, max_neurons))
 

@@ -107,7 +107,10 @@ def edge_list(adjacent: Bool) -> U2:
 
 @kernel(inner=True)
 def _three_nearest(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
-    """Write the three neurons nearest to each point, nearest first."""
+    """Write the three neurons nearest to each point, nearest first, to ``nearest`` (n, 3).
+
+    ``count`` is the number of neurons.
+    """
     padded = (count + LANES - 1) // LANES * LANES
     mask = index_mask(padded)
     for k in range(cloud.x.size):
@@ -118,7 +121,10 @@ def _three_nearest(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
 
 @kernel(inline=True)
 def _move_to_means(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
-    """Move each neuron to the mean of the points it is nearest to."""
+    """Move each neuron to the mean of the points it is nearest to.
+
+    ``nearest`` (n, 3) is from `_three_nearest`; ``count`` is the number of neurons.
+    """
     sums = np.zeros((count, 4))
     for k in range(cloud.x.size):
         i = nearest[k, 0]
@@ -135,7 +141,7 @@ def _move_to_means(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
 
 @kernel(fast=True, inner=True)
 def _mean_spacing(gas: Gas, count: int) -> float:
-    """Return the mean distance from a neuron to the nearest other one."""
+    """Return the mean distance from a neuron to the nearest other one of the ``count`` neurons."""
     x, y, z = gas.x, gas.y, gas.z
     total = 0.0
     for i in range(count):
@@ -153,13 +159,18 @@ def _mean_spacing(gas: Gas, count: int) -> float:
 
 @kernel(inner=True)
 def _squared_distance(gas: Gas, i: int, j: int) -> float:
+    """Return the squared distance of neurons i and j."""
     dx, dy, dz = gas.x[i] - gas.x[j], gas.y[i] - gas.y[j], gas.z[i] - gas.z[j]
     return float(dx * dx + dy * dy + dz * dz)
 
 
 @kernel(inner=True)
 def _compact(gas: Gas, adjacent: Bool, members: I4, stays: Bool, count: int) -> int:
-    """Move the neurons that stay to the front; return their number."""
+    """Move those of ``count`` neurons that stay to the front; return their number.
+
+    ``stays`` (count,) says which stay. ``adjacent`` (count, count) and ``members`` (count,), the
+    number of points of each neuron, are changed too.
+    """
     n = 0
     for i in range(count):
         if not stays[i]:
@@ -180,7 +191,10 @@ def _compact(gas: Gas, adjacent: Bool, members: I4, stays: Bool, count: int) -> 
 
 @kernel(inner=True)
 def _components(adjacent: Bool, count: int, part: I4) -> int:
-    """Label connected components, from 0 in order of their first neuron; return their number."""
+    """Label connected components, from 0 in order of their first neuron; return their number.
+
+    ``adjacent`` is (count, count) or larger; the labels are written to ``part`` (count,).
+    """
     part[:count] = -1
     unlabelled = np.zeros(count, np.int64)  # neurons that may have no label yet
     for i in range(count):
@@ -214,7 +228,10 @@ def _components(adjacent: Bool, count: int, part: I4) -> int:
 
 @kernel(inline=True)
 def _bridge(gas: Gas, adjacent: Bool, count: int, part: I4) -> None:
-    """Link the two nearest neurons of different components."""
+    """Link the two nearest neurons of different components.
+
+    ``adjacent`` and ``part`` are as in `_components`; ``adjacent`` is changed in place.
+    """
     best = np.inf
     a, b = 0, 0
     for i in range(count):

@@ -53,6 +53,10 @@ class Rates(NamedTuple):
 
 @kernel(inner=True)
 def _drop_old_edges(degree: I4, wins: I4, edge_birth: I4, count: int, a: int, oldest: int) -> None:
+    """Remove the edges of neuron ``a`` older than ``oldest``; ``count`` is the number of neurons.
+
+    The arrays are from a `Gas`.
+    """
     for j in range(count):
         age = wins[a] + wins[j] - edge_birth[a * degree.size + j]
         # differs: an edge stays if it is the last edge of one of its neurons, so that no neuron is
@@ -83,8 +87,10 @@ def _adapt_to_signal(
 
     Returns the winner, and the largest age of its edges.
 
-    The arrays of a `Gas` are passed one by one: unpacking it takes as long as a step. Step 10 is
-    the caller's: with a conditional call in here, numba counts references to the arrays for each
+    The signal is (``sx``, ``sy``, ``sz``); ``gain`` is the weight of its error, ``mask`` is from
+    `index_mask`, and the rates are as in `Rates`, at this signal. The arrays of a `Gas` with
+    ``count`` neurons are passed one by one: unpacking it takes as long as a step. Step 10 is the
+    caller's: with a conditional call in here, numba counts references to the arrays for each
     signal, which takes longer than all steps together.
     """
     padded = (count + LANES - 1) // LANES * LANES
@@ -107,7 +113,10 @@ def _adapt_to_signal(
 
 @kernel(inner=True)
 def _shuffle(order: I4, state: np.uint64) -> np.uint64:
-    """Shuffle in place (Fisher-Yates) with a 64-bit linear congruential generator (Knuth)."""
+    """Shuffle in place (Fisher-Yates) with a 64-bit linear congruential generator (Knuth).
+
+    ``order`` (n,) is the array, ``state`` the state of the generator; the new state is returned.
+    """
     for i in range(order.size - 1, 0, -1):
         state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
         j = np.int64(((state >> np.uint64(32)) * np.uint64(i + 1)) >> np.uint64(32))
@@ -255,7 +264,10 @@ def grow_thesis(
 
 @kernel(inline=True)
 def _prune(gas: Gas, count: int, before: I4) -> int:
-    """Remove neurons whose ``wins`` are still as in ``before``, but keep 3; return their number."""
+    """Remove neurons whose ``wins`` are still as in ``before``, but keep 3; return their number.
+
+    ``before`` (count,) is changed like the neurons.
+    """
     i = 0
     while i < count:
         if gas.wins[i] != before[i] or count <= 3:
@@ -280,7 +292,7 @@ def _prune(gas: Gas, count: int, before: I4) -> int:
 
 @kernel(fast=True, inner=True)
 def _mean_distance(cloud: Cloud, gas: Gas, count: int) -> float:
-    """Return psi: the mean distance from the neurons to their nearest point."""
+    """Return psi: the mean distance from the ``count`` neurons to their nearest point."""
     total = 0.0
     for i in range(count):
         best = FAR

@@ -36,20 +36,22 @@ class _Vectors:
         self.build = builder
 
     def array(self, kind: Any, value: _Value) -> _Value:
-        """Return the address of the first element of an array."""
+        """Return the address of the first element of an array of the numba type ``kind``."""
         return self._context.make_array(kind)(self._context, self.build, value).data
 
     def splat(self, value: _Value, kind: Any) -> _Value:
-        """Return a vector of equal values."""
+        """Return a vector, of the LLVM type ``kind``, of equal values."""
         blank = ir.Constant(kind, ir.Undefined)
         first = self.build.insert_element(blank, value, _I32(0))
         return self.build.shuffle_vector(first, blank, ir.Constant(_INTS, [0] * LANES))
 
     def load(self, address: _Value, index: _Value, kind: Any) -> _Value:
+        """Return the vector, of the LLVM type ``kind``, that begins at an index of an array."""
         place = self.build.bitcast(self.build.gep(address, [index]), kind.as_pointer())
         return self.build.load(place, align=4)
 
     def store(self, value: _Value, address: _Value, index: _Value) -> None:
+        """Store a vector from an index of an array on."""
         place = self.build.bitcast(self.build.gep(address, [index]), value.type.as_pointer())
         self.build.store(value, place, align=4)
 
@@ -96,6 +98,7 @@ class _Vectors:
         build.position_at_end(end)
 
     def _call(self, name: str, result: Any, *values: _Value) -> _Value:
+        """Call an LLVM function, declared if need be, with a result of the type ``result``."""
         module = self.build.module
         function = module.globals.get(name)
         if function is None:
@@ -109,7 +112,7 @@ def _constant(value: int) -> _Value:
 
 
 def _nearest(count: int) -> Callable[..., Any]:
-    """Return an intrinsic that finds the ``count`` neurons nearest to a point."""
+    """Return an intrinsic of numba that finds the ``count`` neurons nearest to a point."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> _Value:
         """Emit the instructions of ``search``, below."""
@@ -205,6 +208,7 @@ def adapt(
 
 
 def _emit_adapt(context: Any, builder: Any, signature: Any, args: Any) -> _Value:
+    """Emit the instructions of `adapt`, as an intrinsic of numba does; the largest is returned."""
     v, build = _Vectors(context, builder), builder
     arrays = [v.array(signature.args[k], args[k]) for k in range(3)]
     padded, place = args[3], [v.splat(value, _FLOATS) for value in args[4:7]]

@@ -90,7 +90,8 @@ def _cells(points: F4, radius: float) -> tuple[I4, I4]:
     """Return the cell (n,) of each point in a grid of spacing ``radius``, and the grid's size (3,).
 
     Cells are numbered with z fastest. The grid has an empty border, so that the cells with the next
-    lower and the next higher number are always neighbours along z.
+    lower and the next higher number are always neighbours along z. ``points`` (n, 3) and ``radius``
+    are in metres.
     """
     place = ((points - points.min(axis=0).astype(np.float64)) / radius).astype(np.int64) + 1
     size = place.max(axis=0) + 2
@@ -99,6 +100,10 @@ def _cells(points: F4, radius: float) -> tuple[I4, I4]:
 
 @kernel
 def _smooth(points: F4, radius: float, cells: I4, size: I4, order: I4) -> F4:
+    """Return the moved points (m, 3), metres.
+
+    ``cells`` (n,) and ``size`` (3,) are from `_cells`; ``order`` (n,) sorts the points by cell.
+    """
     count = points.shape[0]
     keys = cells[order]
     moved = np.zeros((count, 3), np.float32)
@@ -126,7 +131,9 @@ def _neighbours(
 ) -> int:
     """Write the neighbours of point i to ``offsets``, and return their number.
 
-    A row is the offset of a neighbour from the point, in radii, and the weight of the neighbour.
+    A row of ``offsets`` (n, 4) is the offset of a neighbour from the point, in radii, and the
+    weight of the neighbour. ``cell`` is the point's cell, ``keys`` are the cells in the order
+    ``order``; the other parameters are as in `_smooth`.
     """
     n = 0
     for side in range(9):
@@ -146,7 +153,10 @@ def _neighbours(
 
 @kernel(inline=True)
 def _plane(offsets: F8, n: int) -> tuple[F8, float]:
-    """Return the normal of the plane fitted to weighted points, and the plane's height over 0."""
+    """Return the normal (3,) of the plane fitted to weighted points, and the plane's height over 0.
+
+    The points are the first ``n`` rows of ``offsets``, from `_neighbours`.
+    """
     mean, spread = np.zeros(3), np.zeros((3, 3))
     total = 0.0
     for k in range(n):
@@ -195,7 +205,10 @@ def _least_direction(spread: F8) -> F8:
 
 @kernel(inline=True)
 def _quadric(offsets: F8, n: int, normal: F8, height: float) -> float:
-    """Return the height of the fitted quadric over the plane, at the projection of the origin."""
+    """Return the height of the fitted quadric over the plane, at the projection of the origin.
+
+    ``normal`` and ``height`` are from `_plane`, the other parameters as there.
+    """
     small = 0
     for axis in range(1, 3):
         small = axis if abs(normal[axis]) < abs(normal[small]) else small

@@ -35,7 +35,10 @@ def triangles_of(edges: U2, nodes: int) -> U2:
 
 @kernel(inner=True)
 def _walk(edges: U2, begin: I4, result: U2) -> int:
-    """Write the triangles while there is room, and return their total number."""
+    """Write the triangles to ``result`` (m, 3) while there is room; return their total number.
+
+    ``edges`` are as in `triangles`, ``begin`` (nodes + 1,) is where those of each first node begin.
+    """
     n = 0
     for edge in range(len(edges)):
         i, j = edges[edge, 0], edges[edge, 1]

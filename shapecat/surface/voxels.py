@@ -70,7 +70,10 @@ def read_only(points: F4) -> F4:
 
 @kernel
 def _voxelize(points: F4, voxel: float) -> tuple[F4, bool]:
-    """Return the centroids, and whether every point was finite and in range."""
+    """Return the centroids (m, 3), and whether every point was finite and in range.
+
+    The voxels of the points (n, 3) are ``voxel`` metres wide.
+    """
     count = points.shape[0]
     scale = float(1 << _FRACTION_BITS) / voxel
     limit = float(1 << (19 + _FRACTION_BITS))
@@ -127,7 +130,7 @@ def _voxelize(points: F4, voxel: float) -> tuple[F4, bool]:
 
 @kernel(inline=True)
 def _radix_order(keys: np.ndarray, bound: int) -> np.ndarray:
-    """Return the stable order that sorts ``keys``, which are >= 0 and below ``bound``."""
+    """Return the stable order (n,) that sorts ``keys`` (n,), which are >= 0 and below ``bound``."""
     order = np.arange(keys.size)
     buffer = np.zeros(keys.size, np.int64)
     shift = 0
