@@ -127,7 +127,11 @@ def _labelled_masks(
 
 
 def _smoothed(labels: I4, label: int, box: list[int], radius: int, corner: tuple[int, int]) -> Mask:
-    """Return the mask of a label after a majority filter."""
+    """Return the mask of a label after a majority filter.
+
+    ``labels`` (h, w) are in a window at ``corner`` (left, top) of the image; ``box`` is left, top,
+    right + 1, bottom + 1 of the label in the window; ``radius`` is half the width of the filter.
+    """
     left, top, right, bottom = box
     if right <= left:
         return EMPTY_MASK
@@ -168,7 +172,7 @@ def _step(label: int, packed: int) -> int:
 
 @kernel(inner=True)
 def _step_row(labels: I4, packed: I4, result: I4) -> None:
-    """Apply `_step` to all pixels of a row."""
+    """Apply `_step` to all pixels of a row (w,); ``packed`` and ``result`` are the states (w,)."""
     for u in range(labels.size):
         result[u] = _step(labels[u], packed[u])
 
@@ -177,7 +181,8 @@ def _step_row(labels: I4, packed: I4, result: I4) -> None:
 def _fill(labels: I4, region: tuple[int, int, int, int], narrow: int, wide: int) -> None:
     """Add to objects the pixels that they surround in a region, with one sweep each way.
 
-    ``region`` is left, top, right + 1, bottom + 1. A pixel changes only after its old label has
+    ``labels`` (h, w) is changed in place; ``region`` is left, top, right + 1, bottom + 1;
+    ``narrow`` and ``wide`` are as in `_surrounding`. A pixel changes only after its old label has
     been passed on in all four directions.
     """
     left, top, right, bottom = region
@@ -207,7 +212,9 @@ def _fill(labels: I4, region: tuple[int, int, int, int], narrow: int, wide: int)
 def _surrounding(label: int, w: int, e: int, n: int, s: int, narrow: int, wide: int) -> int:
     """Return the object that surrounds a pixel of label 0 or -1; the label itself if none does.
 
-    ``w``, ``e``, ``n`` and ``s`` are from `_step`, for the four directions.
+    ``w``, ``e``, ``n`` and ``s`` are from `_step`, for the four directions. A gap between two sides
+    of an object is at most ``narrow`` pixels; up to ``wide`` pixels, an object must be seen in
+    three directions.
     """
     across = w >> 16 if w >> 16 == e >> 16 and _gap(w) + _gap(e) <= narrow + 1 else 0
     along = n >> 16 if n >> 16 == s >> 16 and _gap(n) + _gap(s) <= narrow + 1 else 0
@@ -224,15 +231,17 @@ def _surrounding(label: int, w: int, e: int, n: int, s: int, narrow: int, wide: 
 
 @kernel(inner=True)
 def _gap(packed: int) -> int:
+    """Return the distance in a state of `_step`, pixels."""
     return (packed & 0xFFFF) >> 2
 
 
 @kernel
 def _majority(labels: I4, label: int, radius: int, pixels: Bool) -> tuple[int, int, int, int]:
-    """Set each pixel if most pixels of the square around it have the label.
+    """Set each of ``pixels`` (h, w) if most pixels of the square around it have the label.
 
-    Only the part of the square within the image counts. Returns left, top, right + 1 and
-    bottom + 1 of the pixels that are set.
+    ``labels`` (h, w) are those of the pixels. The square extends ``radius`` pixels to each side;
+    only its part within the image counts. Returns left, top, right + 1 and bottom + 1 of the pixels
+    that are set.
     """
     height, width = labels.shape
     west, north, east, south = width, height, 0, 0
@@ -268,6 +277,9 @@ def _majority(labels: I4, label: int, radius: int, pixels: Bool) -> tuple[int, i
 
 @kernel(inner=True)
 def _count(row: I4, label: int, one: int, counts: I4) -> None:
-    """Add ``one``, which is 1 or -1, to the count of each column whose pixel has the label."""
+    """Add ``one``, which is 1 or -1, to the count of each column whose pixel has the label.
+
+    ``row`` (w,) are the labels; ``counts`` (w,) is changed in place.
+    """
     for u in range(row.size):
         counts[u] += one if row[u] == label else 0

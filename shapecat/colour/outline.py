@@ -74,7 +74,10 @@ def _simplified(ring: F8) -> F8:
 
 @kernel
 def _keep_far(line: F8, first: int, last: int, keep: Bool) -> None:
-    """Mark in ``keep`` the corners from ``first`` to ``last`` that the simplified line keeps."""
+    """Mark in ``keep`` the corners from ``first`` to ``last`` that the simplified line keeps.
+
+    ``line`` (n, 2) are the corners, pixels; ``keep`` is (n,).
+    """
     stack = [(first, last)]
     while len(stack) > 0:
         a, b = stack.pop()
@@ -96,9 +99,9 @@ def _keep_far(line: F8, first: int, last: int, keep: Bool) -> None:
 def _trace(inside: Bool, corners: I4, ends: I4) -> int:
     """Trace the borders of regions, with the inside on the right; return the number of borders.
 
-    ``inside`` (h, w) is False along its edge. ``corners`` gets the column and row of the corners of
-    all borders, ``ends`` the number of corners up to the end of each border. A border starts along
-    the top of a pixel, to the right.
+    ``inside`` (h, w) is False along its edge. ``corners`` (n, 2) gets the column and row of the
+    corners of all borders, ``ends`` (k,) the number of corners up to the end of each border. A
+    border starts along the top of a pixel, to the right.
     """
     walked = np.zeros(inside.shape, np.bool_)
     count = length = 0
@@ -130,7 +133,10 @@ def _trace(inside: Bool, corners: I4, ends: I4) -> int:
 
 @kernel(inner=True)
 def _turn(du: int, dv: int, left: int, right: int) -> tuple[int, int]:
-    """Return the next direction: right if ``right`` is outside, left if both are inside."""
+    """Return the next direction: right if ``right`` is outside, left if both are inside.
+
+    The present direction is ``du``, ``dv``; ``left`` and ``right`` are the pixels ahead, 1 inside.
+    """
     if not right:
         return -dv, du
     return (dv, -du) if left else (du, dv)

@@ -77,7 +77,8 @@ def kernel_lens(lens: LensCamera) -> Lens:
 def rectified(pixels: U1, lens: LensCamera) -> U1:
     """Return a colour image (h, w, 3) uint8 without the distortion of its lens.
 
-    Colours are interpolated bilinearly. Pixels outside the original image are black.
+    ``pixels`` is the image (h, w, 3). Colours are interpolated bilinearly. Pixels outside the
+    original image are black.
     """
     if not lens.model:
         return pixels
@@ -118,7 +119,10 @@ def _monotonic_up_to(lens: LensCamera) -> float:
 
 @kernel
 def _to_camera(points: F4, rotation: F4, shift: F4, transformed: F4) -> None:
-    """Transform points (n, 3) to the frame of a camera, (3, n); z is -1 if they are not finite."""
+    """Transform points (n, 3) to the frame of a camera, (3, n); z is -1 if they are not finite.
+
+    ``rotation`` (3, 3) and ``shift`` (3,), metres, are the pose; writes to ``transformed``.
+    """
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         finite = np.isfinite(x + y + z)

@@ -78,7 +78,11 @@ class _Match(NamedTuple):
 
 
 def _match(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> _Match:
-    """Return the pixels that match a mask; ``owners`` (h, w) is the number of each pixel's mask."""
+    """Return the pixels that match a mask; ``owners`` (h, w) is the number of each pixel's mask.
+
+    ``pixels`` (h, w, 3) is the colour image; ``scale`` multiplies the distances `_BAND_PX` and so
+    on.
+    """
     band_px, radius = max(2.0, _BAND_PX * scale), max(3, round(_WINDOW_PX * scale))
     margin, (left, top, width, height) = int(band_px) + radius, mask.box
     rows = slice(max(0, top - margin), top + height + margin)
@@ -98,7 +102,10 @@ def _match(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> _Ma
 
 
 def _claim(match: _Match, number: int, owners: I4) -> Mask:
-    """Give mask ``number`` the matching pixels that no other mask owns; return the new mask."""
+    """Give mask ``number`` the matching pixels that no other mask owns; return the new mask.
+
+    ``owners`` is as in `_match`, changed in place.
+    """
     rows, columns = match.window
     part = owners[match.window]
     claimed = match.wanted & ((part == number) | (part == 0))
@@ -107,6 +114,7 @@ def _claim(match: _Match, number: int, owners: I4) -> Mask:
 
 
 def _cut_out(inside: Bool, left: int, top: int) -> Mask:
+    """Return a mask (h, w) whose first pixel is (``left``, ``top``), without empty margins."""
     rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
     if not rows.size:
         return EMPTY_MASK
@@ -119,9 +127,9 @@ def _compare(colours: U1, depth: F4, band: float, core: float, window: int, log_
     """Write to ``log_ratio`` the log-likelihood ratio of inside to outside, for pixels in the band.
 
     The colours of each side are modelled by a normal distribution with the same variance in all
-    channels, fitted to a grid of pixels around the pixel. ``depth`` (h, w) is the distance from the
-    outline in pixels, positive inside. ``band``, ``core`` and ``window`` are as `_BAND_PX`,
-    `_CORE_PX` and `_WINDOW_PX`, in pixels of the colour image.
+    channels, fitted to a grid of pixels around the pixel. ``colours`` are (h, w, 3). ``depth`` (h,
+    w) is the distance from the outline in pixels, positive inside. ``band``, ``core`` and
+    ``window`` are as `_BAND_PX`, `_CORE_PX` and `_WINDOW_PX`, in pixels of the colour image.
     """
     height, width, channels = colours.shape
     step = max(1, window // 4)

@@ -152,8 +152,8 @@ def _row_and_column(pixel: int, row: int, width: int) -> tuple[int, int]:
 def _project_pixels(depth: F4, pixels: U4, rays: tuple[F4, F4, F4], lens: Lens) -> F4:
     """Return the projection (4, n) of depth pixels into a camera.
 
-    The rows are column, row, inverse depth in the camera (0 where it does not see the pixel), and
-    depth in the depth image.
+    ``pixels`` and ``rays`` are as in `_splat`. The rows are column, row, inverse depth in the
+    camera (0 where it does not see the pixel), and depth in the depth image.
     """
     by_column, by_row, shift = rays
     moved = np.zeros((4, pixels.size), np.float32)
@@ -175,9 +175,11 @@ def _project_pixels(depth: F4, pixels: U4, rays: tuple[F4, F4, F4], lens: Lens) 
 def _cover(projections: F4, labels: I4, half: float, size: tuple[int, int], boxes: I4) -> I4:
     """Return, for each depth pixel, the square of image pixels whose centres it covers.
 
+    ``labels`` (n,) are those of the depth pixels, ``size`` is width and height of the image.
     Squares are (n, 4) left, top, right + 1, bottom + 1; zeros outside the image. ``boxes`` is set
-    to the box around the squares of each label. ``projections`` is from `_project_pixels`; ``half``
-    is half the width of a depth pixel in colour pixels at equal distance.
+    to such a box around the squares of each label, (labels, 4). ``projections`` is from
+    `_project_pixels`; ``half`` is half the width of a depth pixel in colour pixels at equal
+    distance.
     """
     nought, one = np.float32(0), np.float32(1)
     width, height = np.float32(size[0]), np.float32(size[1])
@@ -201,7 +203,8 @@ def _cover(projections: F4, labels: I4, half: float, size: tuple[int, int], boxe
 def _window(boxes: I4, margin: int, size: tuple[int, int]) -> tuple[int, int, int, int]:
     """Return left, top, right + 1, bottom + 1 of a window that encloses boxes with a margin.
 
-    The boxes are shifted into the window in place; empty boxes become zeros.
+    ``boxes`` (k, 4) are from `_cover`, ``size`` is width and height of the image. The boxes are
+    shifted into the window in place; empty boxes become zeros.
     """
     left, top, right, bottom = size[0], size[1], 0, 0
     for box in boxes:
@@ -231,7 +234,7 @@ def _paint(
     """Paint the labels of squares into a window, where they are the nearest.
 
     ``inverse_depth`` (n,) is that of the squares, ``nearest`` (h, w) that of the painted labels.
-    ``corner`` is the left and top of the window.
+    ``corner`` is the left and top of the window; the labels go to ``splat`` (h, w).
     """
     left, top = corner
     for i in range(labels.size):
@@ -246,7 +249,8 @@ def _paint(
 def _nearest_surface(around: F4, corner: tuple[int, int], cell: int, shape: tuple[int, int]) -> F4:
     """Return the largest inverse depth of points in each cell of a window.
 
-    ``around`` is from `_project_pixels`; cells are squares of ``cell`` pixels.
+    ``around`` is from `_project_pixels`; ``corner`` is left and top of the window, ``shape`` its
+    height and width; cells are squares of ``cell`` pixels.
     """
     height, width = np.float32(shape[0]), np.float32(shape[1])
     left, top, per_cell = np.float32(corner[0]), np.float32(corner[1]), np.float32(1 / cell)
@@ -263,7 +267,8 @@ def _nearest_surface(around: F4, corner: tuple[int, int], cell: int, shape: tupl
 def _hide(front: F4, cell: int, boxes: I4, nearest: F4, splat: I4) -> None:
     """Set the labels in boxes to 0 where another surface hides them.
 
-    ``front`` is from `_nearest_surface`; ``nearest`` (h, w) is the inverse depth of the labels.
+    ``front`` is from `_nearest_surface`, with its ``cell``; ``splat`` (h, w) holds the labels;
+    ``nearest`` (h, w) is the inverse depth of the labels.
     """
     limit, share = np.zeros(splat.shape[1], np.float32), np.float32(1 - _HIDDEN)
     for k in range(boxes.shape[0]):

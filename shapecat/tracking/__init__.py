@@ -1,6 +1,7 @@
 """Objects over time: association, track stitching and fusion (thesis 7.5.2).
 
-`track_recording` combines these steps: it turns the detections of each stream into tracks.
+`track_recording` combines these steps: it turns the detections of each stream into tracks. In all
+steps, ``track`` (n,) are the indices of a track's detections in the `DetectionTable`, ascending.
 """
 
 from shapecat.tracking.detection_table import DetectionTable, TableBuilder

@@ -65,6 +65,7 @@ def assign(costs: F8, limit: float, method: Literal["hungarian", "greedy"]) -> I
 
 
 def _greedy(gain: F8) -> I4:
+    """Return pairs (p, 2) of rows and columns of ``gain`` (m, n), the smallest value first."""
     rows, columns = np.nonzero(gain)
     free_row, free_column = np.ones(gain.shape[0], bool), np.ones(gain.shape[1], bool)
     pairs = []

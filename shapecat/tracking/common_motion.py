@@ -50,7 +50,7 @@ class CommonMotion:
         return replace(table, centers=centers, orientations=orientations)
 
     def moved(self, rows: I4, places: F8) -> F8:
-        """Transform positions (k, 3), metres, back from the coordinate frame of the still objects.
+        """Transform ``places`` (k, 3), metres, back from the coordinate frame of the still objects.
 
         The result is in the coordinate frame of the detections in frames ``rows`` (k,).
         """
@@ -123,7 +123,17 @@ def _level(table: DetectionTable) -> F8:
 
 
 def _between_neighbours(plane: C16, rows: I4, owner: I4, count: int) -> tuple[C16, C16]:
-    """Return the motion of each frame as the product of the motions between neighbouring frames."""
+    """Return the motions of all frames, chained from the fits of neighbouring frames.
+
+    Returns the rotation and the translation (count,) that map each frame to the first one, as
+    complex numbers (see `_fit`).
+
+    Parameters
+    ----------
+    plane : (n,) horizontal positions of detections, metres, complex.
+    rows, owner : (n,) frame and track of each.
+    count : number of frames.
+    """
     order = np.lexsort([rows, owner])
     a, b = order[:-1], order[1:]
     pair = (owner[a] == owner[b]) & (rows[b] - rows[a] == 1)
@@ -144,8 +154,9 @@ def _fit(
 ) -> tuple[C16, C16]:
     """Fit the rotation and the translation of each frame that map ``observed`` to ``reference``.
 
-    A frame with fewer than two points keeps its ``turn`` and ``shift``. Points and translations in
-    the plane are complex numbers; a rotation is a complex number of modulus 1.
+    Both are (n,), ``rows`` (n,) is the frame of each point, ``weights`` (n,) its weight. A frame
+    with fewer than two points keeps its ``turn`` and ``shift``. Points and translations in the
+    plane are complex numbers; a rotation is a complex number of modulus 1.
     """
     count = len(turn)
     mean_observed = _means(observed, rows, weights, count)
@@ -159,17 +170,25 @@ def _fit(
 
 
 def _sums(values: C16, groups: I4, count: int) -> C16:
+    """Return the sums (count,) of ``values`` (n,) in each of the ``groups`` (n,), from 0."""
     real = np.bincount(groups, values.real, count)
     return np.asarray(real + 1j * np.bincount(groups, values.imag, count))
 
 
 def _means(values: C16, groups: I4, weights: F8, count: int) -> C16:
+    """Return the means (count,) of ``values`` (n,) in each of the ``groups`` (n,), from 0.
+
+    ``weights`` (n,) are those of the values.
+    """
     total = np.bincount(groups, weights, count)
     return _sums(values * weights, groups, count) / np.maximum(total, 1e-300)
 
 
 def _in_space(level: F8, turn: C16, shift: C16) -> CommonMotion:
-    """Convert rotations and translations in the horizontal plane to 3D."""
+    """Convert rotations and translations in the horizontal plane to 3D.
+
+    ``turn`` and ``shift`` are from `_fit`, in the x-y plane of the frame ``level`` from `_level`.
+    """
     zero, one = np.zeros(len(turn)), np.ones(len(turn))
     flat = np.array(
         [[turn.real, -turn.imag, zero], [turn.imag, turn.real, zero], [zero, zero, one]]

@@ -213,15 +213,16 @@ class TableBuilder:
         )
 
     def _column(self, name: str, kind: str, shape: tuple[Any, ...] = ()) -> Any:
-        """Return a column as an array that takes over its bytes."""
+        """Return a column (n, *shape) that takes over its bytes; "c" stands for all categories."""
         widths = (self._categories if width == "c" else width for width in shape)
         return np.frombuffer(self._bytes.pop(name), kind).reshape(-1, *widths)
 
 
 def _by_time(topics: I4, stamps_ns: I4) -> Any:
-    """Return the indices that sort frames by time but keep the order of recording in each topic.
+    """Return the indices (f,) that sort frames by time but keep each topic's order of recording.
 
-    Frames that any topic recorded before its clock was set back come first.
+    ``topics`` and ``stamps_ns`` (f,) are those of the frames. Frames that any topic recorded before
+    its clock was set back come first.
     """
     streams = [np.flatnonzero(topics == topic) for topic in range(topics.max() + 1)]
     stamps, time = np.unique(stamps_ns, return_inverse=True)

@@ -31,7 +31,10 @@ def without_pieces(table: DetectionTable, tracks: Sequence[I4], max_gap_s: float
 
 
 def _covered(table: DetectionTable, track: I4, max_gap_s: float) -> int:
-    """Count the frames of a track without detection in which another box contains its centre."""
+    """Count the frames of a track without detection in which another box contains its centre.
+
+    Gaps of more than ``max_gap_s`` are left out.
+    """
     rows, detected = table.frame_span(track, max_gap_s)
     others, which = table.of_frames(rows[~detected])
     place = table.positions(track, rows[~detected])[which]
@@ -39,11 +42,12 @@ def _covered(table: DetectionTable, track: I4, max_gap_s: float) -> int:
 
 
 def _covered_beside(table: DetectionTable, k: int, tracks: Sequence[I4], owner: I4) -> int:
-    """Count the frames before and after a track in which a neighbour's box contains its centre.
+    """Count the frames before and after track k in which a neighbour's box contains its centre.
 
-    The track is assumed to move along with the neighbour. On either side, half as many frames are
-    checked as the track has detections. One side alone does not count, as an object may be put into
-    a bowl, or pushed against another object and merged with it from then on.
+    ``owner`` (n,) is the track of each detection in ``table``, negative if none. The track is
+    assumed to move along with the neighbour. On either side, half as many frames are checked as the
+    track has detections. One side alone does not count, as an object may be put into a bowl, or
+    pushed against another object and merged with it from then on.
     """
     track, counts = tracks[k], list[int]()
     span = len(track) // 2

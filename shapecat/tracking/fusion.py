@@ -111,6 +111,7 @@ def fuse_novelty(novelties: ArrayLike, weights: ArrayLike) -> float:
 
 
 def _evidence(views: F8, method: str) -> F8:
+    """Return what is summed over views (k, c) of posteriors: probabilities, logarithms or votes."""
     if method == "mean":
         return views
     if method == "product":

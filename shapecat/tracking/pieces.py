@@ -46,7 +46,10 @@ def join_pieces(table: DetectionTable, tracks: Sequence[I4]) -> list[I4]:
 
 
 def _count_fits(table: DetectionTable, tracks: Sequence[I4]) -> Counter[tuple[int, int]]:
-    """Count, for each pair of tracks, the frames in which they are pieces of one object."""
+    """Count, for each pair of tracks, the frames in which they are pieces of one object.
+
+    ``tracks`` are the detections (n,) of each track.
+    """
     owner, counts = table.track_of_each(tracks), Counter[tuple[int, int]]()
     wholes = np.array([_wholes(table, track) for track in tracks])
     for block in table.blocks():
@@ -79,7 +82,10 @@ def _whole(table: DetectionTable, track: I4) -> F8:
 
 
 def _neighbours(table: DetectionTable, owner: I4, block: slice) -> I4:
-    """Return the pairs (p, 2) of tracked detections in the same frame that are near each other."""
+    """Return the pairs (p, 2) of tracked detections in the same frame that are near each other.
+
+    ``block`` selects the detections, ``owner`` (n,) is the track of each, negative if none.
+    """
     tracked = block.start + np.flatnonzero(owner[block] >= 0)
     frames = 2 * _NEAR_M * table.rows[tracked]  # no detection is near one of another frame
     positions = np.column_stack([table.centers[tracked], frames])
@@ -115,7 +121,7 @@ def _joint(table: DetectionTable, pairs: I4) -> F8:
 
 
 def _largest(table: DetectionTable, track: I4) -> I4:
-    """Return the largest detection of each frame."""
+    """Return the largest detection of each frame (f,), of the detections ``track`` (n,)."""
     volume = table.sizes[track].astype(np.float64).prod(axis=1)
     order = track[np.lexsort([-volume, table.rows[track]])]
     first = np.concatenate([[True], np.diff(table.rows[order]) > 0])

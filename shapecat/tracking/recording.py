@@ -95,7 +95,10 @@ def _follow(table: DetectionTable, settings: TrackingSettings) -> list[I4]:
 
 
 def _associate(table: DetectionTable, cuts: Bool, settings: TrackingSettings) -> I4:
-    """Return the tracker's track number of each detection, (n,)."""
+    """Return the tracker's track number of each detection, (n,).
+
+    ``cuts`` (f,) are the frames that begin a new scene.
+    """
     tracker, ids = Tracker(settings), np.zeros(len(table.rows), np.int32)
     frames = zip(table.stamps_ns.tolist(), cuts.tolist(), strict=True)
     for row, (stamp_ns, cut) in enumerate(frames):
@@ -172,8 +175,8 @@ def _extent(table: DetectionTable, track: I4) -> F8:
 def _line(table: DetectionTable, detections: I4, at: int) -> tuple[F8, F8]:
     """Fit a constant velocity to detections; return a position, metres, and the velocity, m/s.
 
-    The position is the one at detection number ``at``, the first or the last. A prior for standing
-    still keeps the velocity of a few noisy points small.
+    The position is the one at detection number ``at``, 0 or -1, of ``detections`` (n,). Both
+    results are (3,). A prior for standing still keeps the velocity of a few noisy points small.
     """
     stamps, centers = table.stamps(detections), table.centers[detections]
     t = (stamps - stamps[at]) * 1e-9
@@ -185,7 +188,8 @@ def _line(table: DetectionTable, detections: I4, at: int) -> tuple[F8, F8]:
 def _needed(table: DetectionTable, scenes: I4, row: int, min_hits: int) -> int:
     """Return the number of detections that confirm a track born in frame ``row``.
 
-    Frames of other topics do not count, as their sensors may not see the object.
+    ``scenes`` (f,) is the scene of each frame; ``min_hits`` is the most that is needed. Frames of
+    other topics do not count, as their sensors may not see the object.
     """
     frames_near, stamps, topics = 1, table.stamps_ns, table.topics
     for direction in (1, -1):
@@ -199,6 +203,7 @@ def _needed(table: DetectionTable, scenes: I4, row: int, min_hits: int) -> int:
 
 
 def _build_track(number: int, stream: _Followed, track: I4, settings: TrackingSettings) -> Track:
+    """Return the track ``number``, whose detections are ``track`` (n,)."""
     table = stream.table
     rows, source = table.frame_span(track, settings.max_missed_s)
     views, weights = table.posteriors[track], table.weights(track)

@@ -122,7 +122,10 @@ def _contradiction(keys: F8, other_keys: F8, size_known: Bool, other_size_known:
 
 
 def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> Iterator[I4]:
-    """Yield, for each fragment, later ones that start near its position or soon after its end."""
+    """Yield, for each fragment, later ones that start near its position or soon after its end.
+
+    ``limit`` (n,) is the largest distance for each fragment, metres. Yields indices (k,).
+    """
     if len(limit) == 0:
         return
     tree = cKDTree(fragments.start)
@@ -143,8 +146,8 @@ def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> 
 def _distances(fragments: Fragments, i: int, after: I4, settings: TrackingSettings) -> F8:
     """Return the distances (k,), metres, between the end of fragment i and the starts of ``after``.
 
-    Over a short gap, both are also extrapolated with their velocities to the middle of the gap; the
-    smaller distance counts.
+    ``after`` (k,) are indices of fragments. Over a short gap, both are also extrapolated with their
+    velocities to the middle of the gap; the smaller distance counts.
     """
     resting = np.linalg.norm(fragments.start[after] - fragments.end[i], axis=1)
     gap_s = (fragments.first_ns[after] - fragments.last_ns[i])[:, None] * 1e-9
@@ -159,10 +162,11 @@ def scene_cuts(table: DetectionTable, settings: TrackingSettings) -> Bool:
     """Return the mask (f,) of frames of a stream that begin a new scene.
 
     Recordings of single images can show different objects at the same position from one frame to
-    the next. Two frames disagree if fewer than half of the objects that have a neighbour in the
-    other frame are found again. A single odd frame is not a cut: the frames on both sides of it
-    must disagree too. Only frames of one topic are compared, as other sensors may see other
-    objects. Frames without detections are ignored. A clock that jumps back by more than
+    the next. Only objects less than 0.3 m from some object of the other frame are compared. Two
+    frames disagree if fewer than half of these match an object there in position and size and, over
+    0.3 s apart, in posterior (see `_continues`). A single odd frame is not a cut: the frames on
+    both sides of it must disagree too. Only frames of one topic are compared, as other sensors may
+    see other objects. Frames without detections are ignored. A clock that jumps back by more than
     ``max_missed_s`` also begins a new scene.
     """
     stamps, filled = table.stamps_ns, np.unique(table.rows)

@@ -134,6 +134,10 @@ class Tracker:
         return result
 
     def _advance(self, stamp_ns: int, detections: _Active, partial: Bool, topic: int) -> I4:
+        """Associate the detections of a frame, sorted; return their track numbers (n,).
+
+        ``partial`` (n,) says which detections are partial views.
+        """
         elapsed_s = self._tick(stamp_ns)
         detections.born_ns[:] = detections.seen_ns[:] = self._clock_ns
         detections.topics[:] = topic
@@ -179,7 +183,11 @@ class Tracker:
 
 
 def _seed(centers: F8, size_keys: F8, posteriors: F8) -> _Active:
-    """Return new tracks for detections, without numbers."""
+    """Return new tracks for detections, without numbers.
+
+    ``centers`` (n, 3) are in metres; ``size_keys`` (n, 3) are from `size_key`, ``posteriors`` (n,
+    c).
+    """
     n = len(centers)
     variance = np.tile([_NOISE_M**2, 0.0, _SPEED_M_S**2], (n, 1))
     return _Active(
@@ -221,7 +229,8 @@ def _predict(tracks: _Active, elapsed_s: float) -> _Active:
 def _costs(tracks: _Active, detections: _Active, clock_ns: int, settings: TrackingSettings) -> F8:
     """Return the costs (m, n) of pairs: distance relative to the gate, plus size and posterior.
 
-    Tracks that are not confirmed cost more; pairs beyond the gate cost infinity.
+    ``clock_ns`` is the present time. Tracks that are not confirmed cost more; pairs beyond the gate
+    cost infinity.
     """
     distance = np.linalg.norm(tracks.position[:, None] - detections.position[None], axis=2)
     unseen_s = np.minimum((clock_ns - tracks.seen_ns) * 1e-9, 0.2)
@@ -238,7 +247,10 @@ def _costs(tracks: _Active, detections: _Active, clock_ns: int, settings: Tracki
 
 
 def _correct(tracks: _Active, detections: _Active, pairs: I4, partial: Bool) -> None:
-    """Update tracks in place with their detections."""
+    """Update tracks in place with their detections.
+
+    ``pairs`` (p, 2) are rows of both; ``partial`` (n,) says which detections are partial views.
+    """
     i, j = pairs.T
     tracks.missed[i], tracks.topics[i] = 0, detections.topics[j]
     tracks.seen_ns[i] = detections.seen_ns[j]
