@@ -51,11 +51,11 @@ class SearchResult:
 def find_recordings(sources: Sequence[str]) -> SearchResult:
     """Return the recordings among files, folders and URLs.
 
-    A pattern such as ``*.mcap`` is expanded, unless a file has this name; programs may call the
-    command without a shell. Folders are searched recursively; hidden files, hidden folders and run
-    folders are left out, and a ROS 2 bag counts as one recording. A file that is the only source
-    is always kept. Of several files, those with neither the suffix nor the first bytes of a
-    recording are skipped and counted, so that ``folder/*`` works.
+    A pattern such as ``*.mcap`` is expanded here too, as programs may call the command without a
+    shell; a file with this very name comes first. Folders are searched recursively; hidden files,
+    hidden folders and run folders are left out, and a ROS 2 bag counts as one recording. A file
+    that is the only source is always kept. Of several files, those with neither the suffix nor the
+    first bytes of a recording are skipped and counted, so that ``folder/*`` works.
 
     Raises
     ------

@@ -69,6 +69,7 @@ class Densities:
     """
 
     def __init__(self, x: F4, y: np.ndarray, blocks: Sequence[slice], kernels: int) -> None:
+        """Fit densities to descriptors ``x`` (n, d) with labels ``y`` (n,), block by block."""
         rng = np.random.default_rng(0)
         self._scaler = StandardScaler().fit(x)
         self._blocks = blocks
@@ -99,6 +100,10 @@ class Densities:
         return np.asarray(np.clip(values, -_CLIP, _CLIP))
 
     def _own_densities(self, views: Sequence[F8], block: slice, width: float) -> F8:
+        """Return the log densities (n,) of views in a block, under their own categories.
+
+        ``views`` are (k, d) for each category; ``width`` is the bandwidth of the block.
+        """
         pairs = zip(views, self._kernels, strict=True)
         values = [_log_density(z[:, block], own[:, block], width) for z, own in pairs]
         found = np.concatenate(values)
@@ -150,6 +155,7 @@ class _DensityProduct:
         return self
 
     def predict_proba(self, x: F4) -> F8:
+        """Return the posteriors (n, c) of descriptors (n, d)."""
         return softmax(self._densities.log_densities(x) @ self._densities.deviation)
 
 
@@ -172,6 +178,7 @@ class _ForestLeaves:
         return self
 
     def predict_proba(self, x: F4) -> F8:
+        """Return the posteriors (n, c) of descriptors (n, d)."""
         words = self._encoder.transform(self._forest.apply(self._features(x)))
         logits = [learner.decision_function(words) for learner in self._learners]
         return softmax(np.stack(logits, axis=1))

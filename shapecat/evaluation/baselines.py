@@ -122,6 +122,10 @@ def _predict_all(
 
 
 def _compared(name: str, learned: int, truth: I4, posteriors: F8) -> Compared:
+    """Return the figures of a classifier that was trained on ``learned`` views.
+
+    ``truth`` (n,) are the true columns, ``posteriors`` are (n, c).
+    """
     predicted = posteriors.argmax(axis=1)
     table = metrics.confusion(truth, predicted, posteriors.shape[1])
     figures = (
@@ -175,4 +179,5 @@ def _in_order(posteriors: F4, found: Any, categories: tuple[str, ...]) -> F8:
 
 
 def _d2(views: DescribedViews) -> F4:
+    """Return the distributions (n, d) of point distances, the first third of all functions."""
     return views.functions[:, : views.functions.shape[1] // 3]

@@ -103,6 +103,7 @@ def _content(path: Path) -> bytes:
 
 
 def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], _Layout]:
+    """Return the words of each line of a header, by the first word, and the body's layout."""
     found = re.search(rb"^DATA +(\w+)\s*?\n", content[:_LARGEST_HEADER], re.MULTILINE)
     if not found:
         msg = "it has no line DATA"
@@ -130,6 +131,7 @@ def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], _Layout]:
 
 
 def _ply_header(content: bytes) -> tuple[F8 | None, _Layout]:
+    """Return the words of the comment VIEWPOINT as numbers, None without it, and the layout."""
     end = re.search(rb"^end_header\r?\n", content[:_LARGEST_HEADER], re.MULTILINE)
     if not content.startswith(b"ply") or not end:
         msg = "it has no header"
@@ -156,7 +158,14 @@ def _ply_header(content: bytes) -> tuple[F8 | None, _Layout]:
 
 
 def _xyz(body: bytes, layout: _Layout) -> F8:
-    """Return the points (n, 3) of an ascii or binary body, whose size bounds the memory."""
+    """Return the points (n, 3) of an uncompressed body.
+
+    Memory is bounded by the size of the body, whatever number of points the header announces.
+
+    Raises
+    ------
+    ValueError : the body has fewer points, or its encoding is unknown.
+    """
     if layout.encoding == "ascii":
         columns = _ascii_columns(layout.point)
         lines = body.decode("ascii", "replace").splitlines()
@@ -208,7 +217,10 @@ def _unpack_pcd(body: bytes, layout: _Layout) -> F8:
 
 @kernel
 def _unpack_lzf(packed: U1, flat: U1) -> int:
-    """Unpack LZF (Lehmann 2000) into ``flat``; return the number of bytes, -1 if damaged."""
+    """Unpack LZF (Lehmann 2000) into ``flat``; return the number of bytes, -1 if damaged.
+
+    ``packed`` (n,) and ``flat`` (m,) are bytes.
+    """
     i = np.int64(0)
     out = np.int64(0)
     while i < packed.size:

@@ -194,7 +194,10 @@ def find_viewpoint(points: F4) -> F8:
 
 
 def _covered_cells(points: F8, direction: F8, cell: float) -> int:
-    """Return the number of cells that points (n, 3) cover, projected along a direction (3,)."""
+    """Return the number of cells that points (n, 3) cover, projected along a direction (3,).
+
+    A cell is ``cell`` metres wide.
+    """
     right = np.array([-direction[1], direction[0], 0.0])
     right /= np.linalg.norm(right)
     across = points @ np.stack([right, np.cross(direction, right)], axis=1)

@@ -188,6 +188,7 @@ def require_categories(names: Sequence[str], categorizer: Categorizer) -> None:
 
 
 def _novelty_figures(unknown: F4, known: F4) -> dict[str, float | None]:
+    """Return AUROC, and the fraction of unknown views rejected, from novelties (n,) and (m,)."""
     return {
         "n": len(unknown),
         "auroc": _defined(metrics.auroc(unknown, known)),
@@ -196,7 +197,10 @@ def _novelty_figures(unknown: F4, known: F4) -> dict[str, float | None]:
 
 
 def _accuracy_over(values: np.ndarray, right: I4, edges: Sequence[float], unit: str) -> Ranges:
-    """Return (range, views, accuracy) for each range between ``edges`` that has views."""
+    """Return (range, views, accuracy) for each range between ``edges`` that has views.
+
+    ``values`` (n,) and ``right`` (n,), whether the label is right, are those of the views.
+    """
     rows = []
     for low, high in itertools.pairwise(edges):
         in_range = (values >= low) & (values < high)

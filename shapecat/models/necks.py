@@ -77,7 +77,8 @@ def split_necks(graph: SurfaceGraph, labels: I4, n: int) -> int:
 def _distances(links: U1, spans: I4, labels: I4) -> tuple[I4, int]:
     """Return the distance of each labelled cell from the border of its label, and the cell count.
 
-    The distances (rows, columns) are uninitialised elsewhere.
+    The distances (rows, columns) are uninitialised elsewhere. They count `SIDE` per cell.
+    ``labels`` are (rows, columns); ``links`` and ``spans`` are as in `SurfaceGraph`.
     """
     (rows, columns), count = labels.shape, 0
     distance = unset(labels.shape, np.int16)
@@ -116,7 +117,10 @@ def _distances(links: U1, spans: I4, labels: I4) -> tuple[I4, int]:
 
 @kernel
 def _inner_first(depth: I4, labels: I4, spans: I4, columns: int, count: int) -> I4:
-    """Return the flat indices (count,) of the labelled cells, farthest from the border first."""
+    """Return the flat indices (count,) of the labelled cells, farthest from the border first.
+
+    ``depth`` are from `_distances`, with ``count``; it and ``labels`` are flattened.
+    """
     deepest = 0
     for i in range(len(spans)):
         for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
@@ -140,6 +144,7 @@ def _inner_first(depth: I4, labels: I4, spans: I4, columns: int, count: int) -> 
 
 @kernel(inner=True)
 def _root(parent: I4, basin: int) -> int:
+    """Return the root of a basin in a union-find forest, ``parent`` (k,)."""
     while parent[basin] != basin:
         parent[basin] = parent[parent[basin]]
         basin = parent[basin]
@@ -150,7 +155,9 @@ def _root(parent: I4, basin: int) -> int:
 def _number(cells: I4, basin: I4, parent: I4, size: I4, last: int, labels: I4, n: int) -> int:
     """Label the basins, and return the number of labels.
 
-    The largest basin of each label keeps the label; the others get new ones.
+    ``cells`` (count,) are flat indices; ``basin`` is that of each cell, flattened like ``labels``.
+    The basins 1..last are joined as ``parent`` says; ``size`` is their number of cells. The largest
+    basin of each label 1..n keeps the label; the others get new ones.
     """
     label, largest = unset(last + 1, np.int16), np.zeros(n + 1, np.int32)
     for p in cells:

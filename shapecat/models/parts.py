@@ -197,6 +197,7 @@ def _segment_objects(segments: Segments, counts: I4, object_labels: I4) -> tuple
     """Return the number of cells (n,) of each merged segment, and the object (n,) that it shows.
 
     An object is given by its label; 0 is background, and -1 a segment that mixes several.
+    ``counts`` are from `count_labels`; ``object_labels`` (k,) are the pixel labels of objects.
     """
     joined = np.zeros_like(counts)
     np.add.at(joined, segments.parent, counts)
@@ -209,7 +210,10 @@ def _segment_objects(segments: Segments, counts: I4, object_labels: I4) -> tuple
 def _adjacent_pairs(
     segments: Segments, object_of: I4, view_geometry: ViewGeometry
 ) -> Iterator[tuple[int, int]]:
-    """Yield adjacent pairs of unmixed segments; at least one of each pair shows an object."""
+    """Yield adjacent pairs of segments, of which at least one shows an object.
+
+    Each of the two shows one object or background. ``object_of`` (n,) is from `_segment_objects`.
+    """
     n = segments.parent.size
     for p in range(1, n):
         adjacent = find_adjacent(segments, p, view_geometry)

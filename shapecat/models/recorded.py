@@ -54,6 +54,7 @@ def detected_views(folder: Path) -> Iterator[View]:
 
 
 def _frames(folder: Path) -> Iterator[tuple[Frame, dict[str, Any]]]:
+    """Yield the frames of a labelled recording, each with its entry in truth.json."""
     truth = json.loads((folder / "truth.json").read_text("utf-8"))
     by_stamp = {entry["stamp_ns"]: entry for entry in truth}
     skipped: Counter[str] = Counter()
@@ -63,7 +64,10 @@ def _frames(folder: Path) -> Iterator[tuple[Frame, dict[str, Any]]]:
 
 
 def _best_overlap(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int | None:
-    """Return the index of the candidate with the best IoU; None if this IoU is too small."""
+    """Return the index of the candidate with the best IoU; None if this IoU is too small.
+
+    ``image`` (h, w) are the labels of the pixels, ``item`` is the truth of the object.
+    """
     of_object = np.isin(image, item["parts"])
     shares = [
         of_object[c.indices].sum() / (of_object.sum() + np.count_nonzero(~of_object[c.indices]))
@@ -73,7 +77,10 @@ def _best_overlap(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int 
 
 
 def _nearest(scene: Scene, item: dict[str, Any]) -> int | None:
-    """Return the index of the candidate nearest to an object; None if it is too far away."""
+    """Return the index of the candidate nearest to an object; None if it is too far away.
+
+    ``item`` is the truth of the object.
+    """
     place = np.array(item["centroid_m"])
     gaps = [float(np.linalg.norm(c.box.center - place)) for c in scene.candidates]
     max_distance = 0.5 * max(item["extent_m"])

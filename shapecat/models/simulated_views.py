@@ -270,6 +270,7 @@ def _segment_by_truth(
 
 
 def _centre(item: ArrangedObject) -> F8:
+    """Return the horizontal middle (2,) of an object's mesh, metres."""
     points = item.mesh.vertices[:, :2]
     return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 

@@ -194,6 +194,7 @@ def grow_rejection_trees(samples: Sequence[Samples], seed: int) -> RejectionTree
 
 
 def _grow(rows: Sequence[F4], objects: Sequence[Bool], seed: int) -> BoostedTrees:
+    """Grow trees from features (n, f) of segments, and whether each shows an object (n,)."""
     return grow(np.concatenate(rows), np.concatenate(objects), _GROWTH, seed)
 
 

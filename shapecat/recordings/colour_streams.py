@@ -182,7 +182,10 @@ def _nearest_sensors(
 def _belongs(
     one: ColourStream, stream: Stream, nearest: Mapping[str, Sequence[_NearSensor]]
 ) -> bool:
-    """Return whether colour images belong to the sensor of a depth stream, see `pair_colours`."""
+    """Return whether colour images belong to the sensor of a depth stream, see `pair_colours`.
+
+    ``nearest`` are the sensors nearest to the colour topic, from `_nearest_sensors`.
+    """
     if same_frame(one.frame_id, stream.frame_id):
         return True
     shared = _shared(one, stream)
@@ -210,6 +213,7 @@ def _select(
 
 
 def _rank(one: ColourStream, stream: Stream) -> tuple[bool, int, bool, bool, int, bool, str]:
+    """Return the key by which the colour streams of a depth stream are sorted, the best first."""
     return (
         not (one.frame_id and same_frame(one.frame_id, stream.frame_id)),
         -_shared(one, stream),

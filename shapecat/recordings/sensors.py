@@ -25,7 +25,7 @@ class Stream:
     ----------
     info_topic : topic of the calibration of depth images; None if there is none.
     count : number of messages.
-    frame_id : frame of the first message.
+    frame_id : coordinate frame (``frame_id``) of the first message.
     doubt : why the frames may be wrong, for example because the calibration seems to be that of
         another camera; empty if there is no doubt.
     """

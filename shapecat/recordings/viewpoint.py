@@ -1,4 +1,4 @@
-"""Find the camera pose of an organized cloud that was transformed, as to a robot's base frame."""
+"""Find the camera pose of a transformed organized cloud, for example in a robot's base frame."""
 
 import numpy as np
 

@@ -244,6 +244,7 @@ def writing_outputs(folder: Path) -> Iterator[None]:
 
 
 def _discard(hidden: Path, created: list[Path]) -> None:
+    """Remove a hidden folder, and the parent folders ``created`` for it if they are empty."""
     shutil.rmtree(hidden, ignore_errors=True)
     for parent in created:
         with suppress(OSError):  # not empty: something was written there

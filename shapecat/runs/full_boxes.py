@@ -119,7 +119,10 @@ class FullBoxes:
         return result
 
     def _views(self, sighting: "_Sighting", picked: I4, details: F4) -> BoxViews:
-        """Return the views ``picked`` of a track in the fixed frame, given their `_DETAILS`."""
+        """Return the views ``picked`` (k,) of a track in the fixed frame.
+
+        ``details`` are their columns `_DETAILS`: (k, 3) deviations of the size, then the outlines.
+        """
         boxes, poses = sighting.boxes[picked], self.frames.poses_of(sighting.rows[picked])
         centers, axes = _placed(boxes, poses)
         sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)
@@ -167,7 +170,7 @@ class _Sighting(NamedTuple):
 
 
 def _split(values: F4, lengths: Sequence[int]) -> list[F4]:
-    """Split an array into consecutive parts of the given lengths."""
+    """Split an array along its first axis into consecutive parts of the given lengths."""
     return np.split(values, np.cumsum(lengths, dtype=np.int64))[:-1]
 
 
@@ -177,7 +180,10 @@ def _spread(count: int) -> I4:
 
 
 def _placed(boxes: F4, poses: F8) -> tuple[F8, F8]:
-    """Return the centres (k, 3) and axes (k, 3, 3) of boxes in the fixed frame."""
+    """Return the centres (k, 3) and axes (k, 3, 3) of boxes in the fixed frame.
+
+    ``boxes`` (k, 10) are in the sensor frame, ``poses`` (k, 3, 4) are ``fixed_from_sensor``.
+    """
     turns, places = poses[:, :, :3], poses[:, :, 3]
     axes = turns @ Rotation.from_quat(boxes[:, 6:10]).as_matrix()
     return np.einsum("kij,kj->ki", turns, boxes[:, :3].astype(np.float64)) + places, axes

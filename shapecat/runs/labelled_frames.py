@@ -127,7 +127,10 @@ def _labelled_frame(
     tracks: LabelledTracks,
     ended: tuple[int, ...],
 ) -> LabelledFrame:
-    """Join the table rows of a frame, its detections (by number) and its planes."""
+    """Join the table rows of a frame, its detections (by number) and its planes.
+
+    ``ended`` are the tracks that ended in the topic's previous frame.
+    """
     key = (row["topic"], row["frame"])
     pose = None
     if row["fixed_translation"] is not None:
@@ -169,6 +172,7 @@ def _plane_of(row: Mapping[str, Any]) -> Plane:
 def _labelled_object(
     row: Mapping[str, Any], label: TrackLabel, causal: F4, full: Box | None
 ) -> LabelledObject:
+    """Return an object from its detection's row; ``causal`` (c,) is the causal posterior."""
     return LabelledObject(
         track=label.track,
         category=label.category,
@@ -187,7 +191,10 @@ def _labelled_object(
 
 
 def _join(parts: Sequence[LabelledObject], up: Sequence[float]) -> LabelledObject:
-    """Join the parts of a merged track in one frame into one object."""
+    """Join the parts of a merged track in one frame into one object.
+
+    ``up`` (3,) is the up direction of the frame.
+    """
     if len(parts) == 1:
         return parts[0]
     box = box_around([part.box for part in parts], up)

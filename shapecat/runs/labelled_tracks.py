@@ -187,7 +187,10 @@ def _boxes(
 
 
 def _join(places: F8, up: F4) -> F8:
-    """Return the only box of an object, or the upright box (10,) around its boxes (n, 10)."""
+    """Return the only box of an object, or the upright box (10,) around its boxes (n, 10).
+
+    ``up`` (3,) is the up direction of the frame.
+    """
     place: F8 = places[0]
     if len(places) > 1:
         box = box_around((Box(row[:3], row[3:6], row[6:]) for row in places), up)
@@ -196,6 +199,7 @@ def _join(places: F8, up: F4) -> F8:
 
 
 def _box(label: TrackLabel, row: Sequence[float]) -> AnnotationBox:
+    """Return a box for annotations; ``row`` (10,) is centre, size and orientation."""
     center, size, orientation = tuple(row[:3]), tuple(row[3:6]), tuple(row[6:])
     return AnnotationBox(*label, center, size, orientation)  # type: ignore[arg-type]  # as long as these
 
@@ -249,6 +253,7 @@ def _in_named_frame(
 def _last_in(frames: Mapping[Key, slice], tracks: I4, stamps_ns: I4) -> dict[Key, tuple[int, ...]]:
     """Return the tracks that end in each frame.
 
+    ``frames`` are the rows of each frame; ``tracks`` and ``stamps_ns`` (n,) are those of the rows.
     Within a topic, the last frame of a track is the one with the highest number, since a clock may
     be set back. If a track is in several topics, it ends in the latest of these frames by stamp.
     """

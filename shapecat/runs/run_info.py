@@ -198,6 +198,8 @@ def parse_run(content: bytes, folder: str) -> RunInfo:
 def parse_identity(content: bytes, folder: str) -> RunIdentity:
     """Return the content of a run.json; check only the entries that every version writes.
 
+    ``folder`` is its folder or URL, for error messages.
+
     Raises
     ------
     OutputError : it is damaged, or an entry that every version writes is missing or wrong.

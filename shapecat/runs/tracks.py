@@ -141,7 +141,7 @@ def _read_streams(folder: Path, categories: int, placed: set[str]) -> Iterator[D
     """Yield the detections that are tracked together, numbered by their rows in the table.
 
     Those of all topics in ``placed`` are tracked together, in the fixed frame; those of any other
-    topic on their own, in its sensor frame.
+    topic on their own, in its sensor frame. ``categories`` is the number of categories.
     """
     streams: dict[str, TableBuilder] = {}
     count = 0
@@ -175,7 +175,10 @@ def _read_streams(folder: Path, categories: int, placed: set[str]) -> Iterator[D
 
 
 def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
-    """Return the columns for the tracker as arrays; ``center_fixed`` is NaN if unknown."""
+    """Return the columns for the tracker as arrays; ``center_fixed`` is NaN if unknown.
+
+    ``categories`` is the number of categories.
+    """
     first = table["reused_from"].combine_chunks()
     cut_off = (table[name].to_numpy() for name in ("touches_border", "occluded"))
     return {
@@ -191,7 +194,10 @@ def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
 
 
 def _turns_of(frames: pa.Table, placed: Collection[str]) -> F8:
-    """Return the rotations (f, 3, 3) to the fixed frame; identity if unknown or not ``placed``."""
+    """Return the rotations (f, 3, 3) from sensor to fixed frame, one per row of ``frames``.
+
+    They are the identity where the pose is unknown or the topic is not in ``placed``.
+    """
     turns = numbers_or_nan(frames["fixed_rotation"]).reshape(-1, 3, 3)
     moved = np.array([topic in placed for topic in frames["topic"].to_pylist()])
     moved = moved[:, None, None] & ~np.isnan(turns)
@@ -232,7 +238,10 @@ def _columns(
 
 
 def _line(track: Track, categories: Sequence[str], start_ns: int, work: str) -> dict[str, Any]:
-    """Return the values of a track in tracks.csv."""
+    """Return the values of a track in tracks.csv.
+
+    ``start_ns`` is the stamp from which seconds count; ``work`` is as in `track_run`.
+    """
     guess = categories[int(np.argmax(track.posterior))]
     x, y, z = np.median(track.centers, axis=0)
     return {

@@ -114,7 +114,8 @@ def record(
 ) -> Path:
     """Write a recording of a world, as `simulate` does; return its path.
 
-    ``seed`` seeds the sensor noise, and appears in the name of the scene in the ground truth.
+    ``rate_hz`` is the frame rate. ``seed`` seeds the sensor noise, and appears in the name of the
+    scene in the ground truth.
 
     Raises
     ------
@@ -204,6 +205,7 @@ def _write_colour(writer: Container, world: World, frame: Frame) -> U1:
 
 
 def _truth(world: World, frame: Frame, labels: U1, camera: Camera, seed: int) -> dict[str, Any]:
+    """Return the ground truth of a frame; ``labels`` (h, w) are those of its pixels."""
     return {
         "frame": frame.index,
         "scene": f"sim{seed}",

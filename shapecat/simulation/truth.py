@@ -55,7 +55,7 @@ def frame_truth(world: World, frame: int, labels: U1, camera: Camera) -> dict[st
 def _object_truth(
     world: World, frame: int, item: PlacedObject, pixels: int, share: float
 ) -> dict[str, Any]:
-    """Return the truth of an object; ``share`` is its visible fraction."""
+    """Return the truth of an object with ``pixels`` pixels; its fraction ``share`` is visible."""
     world_from_camera, pose = world.path[frame], world.pose_of(item, frame)
     camera_from_world = inverse(world_from_camera)
     carried = pose.translation[2] > item.pose.translation[2]
@@ -86,6 +86,7 @@ def _object_truth(
 
 
 def _plane_truth(support: Support, camera_from_world: Pose, pixels: int) -> dict[str, Any]:
+    """Return the truth of a support's surface, which has ``pixels`` pixels."""
     normal = camera_from_world.rotation[:, 2]
     point = transform(camera_from_world, support.outline[0])
     return {

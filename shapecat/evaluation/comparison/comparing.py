@@ -187,7 +187,9 @@ def _compare_frame(
 ) -> None:
     """Match the objects of a frame, and count agreements and differences in ``tally``.
 
-    Keep a picture of the frame if it differs most of all frames in its ``part`` of the run.
+    ``row`` is the frame's row in the table of the run; ``clouds`` yields the frames of the
+    recording. Keep a picture of the frame if it differs most of all frames in its ``part`` of the
+    run.
     """
     frame = next((f for f in clouds if (f.topic, f.index) == key), None)
     _require_same_size(found, true, frame, key)
@@ -272,7 +274,8 @@ def _differences(
 def _kind(tally: Tally, a: LabelledItem, b: LabelledItem, f: float | None) -> str | None:
     """Return the most serious difference of a pair, None if there is none.
 
-    Note its track in ``tally.last_tracks``.
+    ``a`` is the found object, ``b`` the true one, ``f`` the overlap F of their masks. Note its
+    track in ``tally.last_tracks``.
     """
     switched = False
     if a.track is not None and b.track is not None:

@@ -140,6 +140,7 @@ def _balanced(pairs: Sequence[tuple[str, str]]) -> float | None:
 
 
 def _tracking(seen: Sequence[FrameIdentities], threshold: float) -> dict[str, Any]:
+    """Return the rounded tracking metrics by name; a pair may match from ``threshold`` on."""
     figures = compute_tracking_metrics(seen, threshold=threshold)._asdict()
     return {
         name: None if value != value else round(value, 4)  # noqa: PLR0124  NaN

@@ -108,7 +108,11 @@ def _clear_mot(frames: Iterable[FrameIdentities], threshold: float) -> Counter[s
 def _pairs(
     frame: FrameIdentities, allowed: Bool, last: Mapping[Hashable, Hashable]
 ) -> list[tuple[int, int]]:
-    """Match a frame: first the previous pairs that are still ``allowed``, then the most similar."""
+    """Match a frame: first the previous pairs that are still ``allowed``, then the most similar.
+
+    ``allowed`` (true, found) says which pairs may match; ``last`` is the found identity that each
+    true one had before. Returns pairs of indices, true and found.
+    """
     true, found, similarity = frame
     place = {name: j for j, name in enumerate(found)}
     pairs: dict[int, int] = {}

@@ -76,6 +76,7 @@ def match_objects(found: Sequence[LabelledItem], true: Sequence[LabelledItem]) -
 
 
 def _best(iou: Any) -> dict[int, int]:
+    """Return the pairs (row, column) with the largest sum of IoU, of at least `SAME_BOX` each."""
     pairs = zip(*(places.tolist() for places in linear_sum_assignment(-iou)), strict=True)
     return {i: j for i, j in pairs if iou[i, j] >= SAME_BOX}
 
@@ -90,7 +91,8 @@ def frame_identities(
 ) -> FrameIdentities:
     """Return the identities of a frame, without duplicates, and their similarity.
 
-    Of several detections of one track, the one most similar to a true object counts.
+    ``matched`` is from `match_objects`. Of several detections of one track, the one most similar to
+    a true object counts.
     """
     best: dict[int, int] = {}
     for i, item in enumerate(found):
@@ -120,6 +122,7 @@ def labelled_part(found: Labelling, true: Labelling) -> Labelling:
 
 
 def _is_ignored(item: LabelledItem, ignored: Bool | None) -> bool:
+    """Return whether most pixels of an object are marked in ``ignored`` (n,), which may be None."""
     if ignored is None or item.pixels is None or not item.pixels.size:
         return False
     return bool(ignored[item.pixels].mean() > 0.5)

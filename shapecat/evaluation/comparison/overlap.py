@@ -105,7 +105,10 @@ def match_masks(found: Sequence[U4], true: Sequence[U4]) -> Matched:
 
 
 def _common(found: Sequence[U4], true: Sequence[U4]) -> I4:
-    """Return the number of pixels that each pair of masks has in common, (found, true)."""
+    """Return the number of pixels that each pair of masks has in common, (found, true).
+
+    A mask is the flat indices (k,) of its pixels.
+    """
     size = max((int(mask.max()) + 1 for mask in (*found, *true) if len(mask)), default=0)
     common = np.zeros((len(found), len(true)), np.int64)
     for k, mask in enumerate(true):

@@ -99,8 +99,9 @@ def _states(
 ) -> U1:
     """Return the state of each pixel, (n,): 0 without an object, else 1 to 4 as in `COLOURS`.
 
-    Where a found object covers a true one that it does not match, its pixels count as surplus, so
-    that split objects are visible.
+    ``pairs`` maps found to true objects, ``rows`` are their differences; the picture has ``size``
+    pixels. Where a found object covers a true one that it does not match, its pixels count as
+    surplus, so that split objects are visible.
     """
     state = np.zeros(size, np.int64)
     for number, labelling in ((2, true), (3, found)):
@@ -146,7 +147,11 @@ def _captions(
     pairs: Mapping[int, int],
     width: int,
 ) -> tuple[Caption, ...]:
-    """Return a caption for each difference, at the position of its object."""
+    """Return a caption for each difference, at the position of its object.
+
+    ``pairs`` maps found to true objects; ``rows`` are the differences of found, then of missed
+    objects. The picture is ``width`` pixels wide.
+    """
     missed = [item for j, item in enumerate(true) if j not in pairs.values()]
     captions = []
     for row, item in zip(rows, [*found, *missed], strict=True):

@@ -289,7 +289,8 @@ def _item(
 ) -> LabelledItem:
     """Join detections to one object.
 
-    ``label`` is its track, category and confidence. The largest detection gives ``view_category``.
+    ``label`` is its track, category and confidence; ``full`` are the full boxes of the detections,
+    None if unknown; ``up`` (3,) is the up direction. The largest detection gives ``view_category``.
     """
     track, category, confidence = label
     boxes = [

@@ -69,6 +69,7 @@ class KittiLabels(Reference[str]):
         return Labelling(tuple(item for item in items if item.category != "DontCare"))
 
     def _item(self, words: list[str], turn: F8) -> LabelledItem:
+        """Return the object in a line; ``turn`` (3, 3) is from `_sensor_from_rectified`."""
         category = self._categories.get(words[0], words[0].replace("_", " "))
         return LabelledItem(track=None, category=category, box=_box(words, turn))
 
@@ -87,6 +88,7 @@ def _listed(path: Path) -> list[tuple[Place, str]]:
 
 
 def _place(row: Mapping[str, str], *, several: bool) -> Place:
+    """Return topic (None for any), stamp and frame number of a row of frames.csv."""
     frame = row.get("frame")
     return row["topic"] if several else None, int(row["stamp_ns"]), int(frame) if frame else None
 

@@ -57,7 +57,7 @@ _Boxes = tuple[F4, list[tuple[int, int, int]], list[str]]
 
 
 class Images:
-    """Writes the colour images of the frames; ``entities`` maps entities to their titles."""
+    """Writes the frames' colour images; ``entities`` maps Rerun entity paths to their titles."""
 
     def __init__(self, columns: Columns) -> None:
         """Start without images."""

@@ -179,7 +179,10 @@ class McapRecording(ChunkedRecording):
             self._reported.add(record.offset)
 
     def _plain(self, record: Record, end: int | None) -> memoryview:
-        """Return the decompressed records of a chunk; verify its checksum the first time."""
+        """Return the decompressed records of a chunk; verify its checksum the first time.
+
+        ``end`` is the number of bytes that are needed; None for all.
+        """
         if end is not None or not record.whole:
             return read_chunk(self.content(record), end=sys.maxsize if end is None else end)
         plain = read_chunk(self.content(record), checked=record.offset in self._checked)

@@ -157,6 +157,12 @@ def read_chunk(content: bytes, *, end: int | None = None, checked: bool = False)
 def _decompress(
     method: Callable[[memoryview, int], bytes | memoryview], data: memoryview, size: int
 ) -> memoryview:
+    """Return ``data``, which has ``size`` bytes when decompressed, by a method of `_DECOMPRESS`.
+
+    Raises
+    ------
+    ChunkError : the data is damaged.
+    """
     try:
         return memoryview(method(data, size))
     except (RuntimeError, ValueError, EOFError, MemoryError, zstandard.ZstdError) as error:

@@ -76,7 +76,10 @@ def read_summary(file: BinaryIO, size: int, warn: Callable[[str], None]) -> Summ
 
 
 def _checksum(file: BinaryIO, size: int, start: int) -> int:
-    """Return the checksum of the summary and of the footer up to its checksum field."""
+    """Return the checksum of the summary and of the footer up to its checksum field.
+
+    ``start`` is the offset of the summary, ``size`` the size of the file.
+    """
     crc, left = 0, size - len(MAGIC) - 4 - start
     file.seek(start)
     while left > 0:
@@ -86,6 +89,7 @@ def _checksum(file: BinaryIO, size: int, start: int) -> int:
 
 
 def _collect(file: BinaryIO, start: int, end: int) -> Summary:
+    """Read the schemas, channels and chunk indexes between two offsets in a file."""
     summary = Summary()
     for record in walk(file, start, end):
         content = read_content(file, record)

@@ -134,7 +134,10 @@ class DatabaseRecording(Recording):
     def _rows(
         self, connections: list[Any], times: list[int | None]
     ) -> Iterator[tuple[int, Any, Any]]:
-        """Yield channel id, time (ns) and data of each message; the data is None if damaged."""
+        """Yield channel id, time (ns) and data of each message; the data is None if damaged.
+
+        ``times`` are start and stop, nanoseconds; None for no limit.
+        """
         count = 0
         try:
             for connection, time, data in self._reader.messages(connections, *times):

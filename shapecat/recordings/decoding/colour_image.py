@@ -150,6 +150,7 @@ def encoded(image: ColourImage, pixels: U1) -> tuple[str, bytes]:
 
 
 def _decompressed(image: ColourImage, shrink: int) -> U1:
+    """Return the pixels (h, w, 3) of a JPEG or PNG file, RGB; ``shrink`` is as in `pixels_of`."""
     from PIL import Image  # noqa: PLC0415  # loaded where there is colour
 
     kind, width, height = compressed_size(image.data)
@@ -167,6 +168,7 @@ def _decompressed(image: ColourImage, shrink: int) -> U1:
 
 
 def _raw_pixels(image: ColourImage) -> U1:
+    """Return the pixels (h, w, 3) of a raw image, RGB."""
     name, rows = image.encoding, _rows(image)
     if name in _LUMA:
         return _from_yuv(rows, _LUMA[name])

@@ -150,9 +150,9 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
 
     Raises
     ------
-    OutputError : the table is unreadable, belongs to another run, or has invalid lines, with
-        unknown tracks, other categories or invalid labels. The error message lists these lines,
-        and nothing is written.
+    OutputError : the table is unreadable, belongs to another run, or has invalid lines: an unknown
+        track, a changed category, or an invalid label. The error message lists these lines, and
+        nothing is written.
     """
     with holding(folder):
         _adopt(corrected, folder)
@@ -255,11 +255,12 @@ def _valid_labels(
 
 
 def _labelled(rows: Iterable[TrackRow], labels: Mapping[int, str]) -> tuple[TrackRow, ...]:
+    """Return the rows with the labels of ``labels``, by track; the others keep theirs."""
     return tuple(with_label(row, labels.get(row.track, row.label)) for row in rows)
 
 
 def has_labels(path: Path) -> bool:
-    """Return whether a table has labels, or invalid lines, which may have labels.
+    """Return whether a table may have labels: it has some, or has invalid lines.
 
     A missing table has none.
 
@@ -286,6 +287,7 @@ def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:
 
 
 def _refuse(path: Path, problems: Sequence[str], effect: str = "nothing was written") -> None:
+    """Raise an `OutputError` that lists ``problems``, if any; ``effect`` says what follows."""
     if problems:
         lines = sorted(problems, key=_line_of)
         if len(lines) > _MOST_PROBLEMS:

@@ -63,7 +63,10 @@ def far_merges(folder: Path, labels: Mapping[int, TrackLabel]) -> list[Gap]:
 
 
 def _read_gaps(folder: Path, objects: Mapping[int, int]) -> list[Gap]:
-    """Return the gap between each two tracks of the same object that have common frames."""
+    """Return the gap between each two tracks of the same object that have common frames.
+
+    ``objects`` maps each track to the number of its object.
+    """
     unmerged = {track: TrackLabel(track, "", 0.0) for track in objects}
     sums: dict[tuple[int, int], tuple[int, float]] = {}
     for frame in read_annotation_frames(folder, LabelledTracks.read(folder, unmerged)):

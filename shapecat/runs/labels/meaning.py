@@ -148,7 +148,7 @@ def _share_a_topic(a: TrackRow, b: TrackRow) -> bool:
 
 
 def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:
-    """Return the track at the end of a chain of merges.
+    """Return the track at the end of a chain of merges; ``verdicts`` are by track.
 
     Raises
     ------

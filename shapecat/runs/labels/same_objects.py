@@ -92,7 +92,11 @@ def _by_majority(
     counts: Counter[int],
     group: Group,
 ) -> Matches:
-    """Match each track of the target with the source object that it matches in most frames."""
+    """Match each track of the target with the source object that it matches in most frames.
+
+    ``votes`` counts, for each pair of source and target track, the frames in which they match, and
+    ``apart`` sums their distances, metres; ``counts`` are the frames of each target track.
+    """
     matches_of: dict[int, list[Match]] = {}
     reasons: dict[int, str] = {}
     claims: dict[int, dict[int, list[int]]] = {}
@@ -121,17 +125,18 @@ def _widths(folder: Path, tracks: TrackDetections) -> F8:
 def _max_distance_at_once(a: F8, b: F8) -> F8:
     """Return the largest distance (n, m) at which detections with these widths may be one object.
 
-    It is half of their mean width, since two objects side by side are farther apart, but at least
-    4 cm and at most 10 cm.
+    The widths are ``a`` (n,) and ``b`` (m,), all in metres. The distance is half of their mean
+    width, since two objects side by side are farther apart, but at least 4 cm and at most 10 cm.
     """
     mean_width = (a[:, None] + b[None]) / 2
     return np.clip(_REACH * mean_width, _LEAST_REACH_M, _MOST_REACH_M)
 
 
 def _mutual_nearest(a: F8, b: F8, max_distance: F8) -> Iterator[tuple[int, int, float]]:
-    """Yield index pairs and distances of mutual nearest neighbours of points (n, 3) and (m, 3).
+    """Yield index pairs and distances of mutual nearest neighbours in ``a`` and ``b``.
 
-    ``max_distance`` (n, m) is the largest distance of each pair, metres.
+    Both are points, (n, 3) and (m, 3); ``max_distance`` (n, m) is the largest distance of each
+    pair, metres.
     """
     apart = np.linalg.norm(a[:, None] - b[None], axis=2)
     nearest = apart.argmin(axis=1)

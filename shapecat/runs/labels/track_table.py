@@ -185,6 +185,10 @@ def _row(line: int, cells: Mapping[str, str]) -> TrackRow | str:
 
 
 def _wrong_numbers(line: int, cells: Mapping[str, str]) -> str:
+    """Return the problem of a line whose track number or confidence is not a number.
+
+    ``cells`` holds the cells of the line by column.
+    """
     text = f"track {cells.get('track', '')!r}, confidence {cells.get('confidence', '')!r}"
     return f"line {line}: expected a track number and a confidence from 0 to 1, got {text}"
 

@@ -56,7 +56,7 @@ def _reason(distances: Sequence[F4], range_m: float, source: str) -> str:
     """Return the likely reason why frames have no plane.
 
     ``distances`` holds an array (n,) for each frame, the distances of its points in metres;
-    ``source`` is the source of the up direction.
+    ``range_m`` is the range of detection; ``source`` is the source of the up direction.
     """
     if not distances:
         return "they have no valid depth"

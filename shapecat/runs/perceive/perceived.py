@@ -152,6 +152,7 @@ class PerceptionTables:
 
 
 def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]]) -> dict[str, Any]:
+    """Return the columns of the frames table, by name."""
     return {
         "topic": [p.topic for p, _ in rows],
         "frame": [p.index for p, _ in rows],
@@ -170,6 +171,7 @@ def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]]) -> dict[str, Any
 
 
 def _pose_columns(name: str, poses: Sequence[Pose | None]) -> dict[str, Any]:
+    """Return the columns of translations (3,) and rotations (9,), row by row; None if unknown."""
     return {
         f"{name}_translation": [pose and pose.translation for pose in poses],
         f"{name}_rotation": [pose and pose.rotation.ravel() for pose in poses],
@@ -179,6 +181,7 @@ def _pose_columns(name: str, poses: Sequence[Pose | None]) -> dict[str, Any]:
 def _detection_columns(
     rows: Sequence[tuple[Perception, FrameRow]], categories: Sequence[str]
 ) -> dict[str, Any]:
+    """Return the columns of the detections table, by name."""
     objects = [(p, row, k, d) for p, row in rows for k, d in enumerate(p.detections)]
     detections = [d for _, _, _, d in objects]
     candidates = [d.candidate for d in detections]
@@ -223,7 +226,10 @@ def _detection_columns(
 
 
 def _height(perception: Perception, plane: int | None, support_m: float, center: Any) -> float:
-    """Return the height of a centre above the object's support, metres; NaN without a plane."""
+    """Return the height of a centre above the object's support, metres; NaN without a plane.
+
+    ``plane`` is the index of the plane; the support is ``support_m`` above it; ``center`` is (3,).
+    """
     if plane is None:
         return float("nan")
     support = perception.scene.planes[plane]
@@ -231,6 +237,7 @@ def _height(perception: Perception, plane: int | None, support_m: float, center:
 
 
 def _plane_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
+    """Return the columns of the planes table, by name."""
     planes = [(p, k, plane) for p in perceptions for k, plane in enumerate(p.scene.planes)]
     return {
         "topic": [p.topic for p, *_ in planes],

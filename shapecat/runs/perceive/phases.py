@@ -143,10 +143,15 @@ def _perceiving(
 ) -> Iterator[Callable[[Iterator[_Item]], tuple[int, int]]]:
     """Let the block perceive frames in several processes; then join the tables.
 
+    Parameters
+    ----------
+    phase, total : name of the phase and number of frames, for progress; None if unknown.
+    again : whether the frames are perceived a second time (`revise`).
+
     Yields
     ------
-    A function that perceives frames and writes the results, except for frames that an interrupted
-    run has written. It returns the number of all frames, and the number written before.
+    A function that skips the frames that an interrupted run has written, perceives the others, and
+    writes their results. It returns the number of all frames, and the number written before.
     """
     job, categorizer = work.job, work.categorizer
     perceiver = Perceiver(categorizer, job.settings, job.model)

@@ -49,7 +49,10 @@ def _places(frames: pa.Table) -> F8:
 
 
 def _jumps(places: F8, stamps_ns: I4) -> tuple[I4, F8]:
-    """Return the indices (k,) of positions (n, 3) before jumps, and the distances (k,), metres."""
+    """Return the indices (k,) of positions (n, 3) before jumps, and the distances (k,), metres.
+
+    ``stamps_ns`` (n,) are the times of the positions.
+    """
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     seconds = np.diff(stamps_ns) * 1e-9
     speeds = np.divide(steps, seconds, out=np.zeros_like(steps), where=seconds > 0)

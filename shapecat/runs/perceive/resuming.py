@@ -98,8 +98,8 @@ def take_over_frames(
 ) -> RunInfo:
     """Take over the perceived frames of a finished run that differs only in later phases.
 
-    Its tables are linked or copied if settings of tracking or of outputs differ, but nothing else.
-    If nothing differs, the user wants everything computed again.
+    Its tables are linked or copied only if nothing but settings of tracking or outputs differs. If
+    nothing at all differs, ``planned`` is returned: the user wants everything computed again.
 
     Parameters
     ----------

@@ -112,8 +112,9 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
 def _fixed_up(stream: _Stream, posed: Bool) -> F8:
     """Return, for each frame, the up direction (n, 3) on which most frames agree.
 
-    The directions are compared in the fixed frame, and the result is in the sensor frame. It is NaN
-    if the frames do not agree, and for frames without a pose.
+    ``posed`` (n,) are the frames with a pose. The directions are compared in the fixed frame, and
+    the result is in the sensor frame. It is NaN if the frames do not agree, and for frames without
+    a pose.
     """
     in_fixed = np.einsum("nij,nj->ni", stream.rotation, stream.up)
     agreed = _agreed(in_fixed[posed & stream.level], _OFF_DEG, _FIXED_SHARE)
@@ -133,7 +134,7 @@ def _still_up(stream: _Stream) -> F8:
 
 
 def _around(stream: _Stream, k: int) -> I4:
-    """Return the indices of the frames near frame ``k``, without ``k``."""
+    """Return the indices (m,) of the frames near frame ``k``, without ``k``."""
     rows = np.arange(max(0, k - _AROUND), min(len(stream.frames), k + _AROUND + 1))
     soon = np.abs(stream.stamps_ns[rows] - stream.stamps_ns[k]) <= _AROUND_NS
     return np.asarray(rows[soon & (rows != k)])
@@ -159,7 +160,8 @@ def _other_support(stream: _Stream, off: Bool) -> Bool:
 def _agreed(up: F8, within_deg: float, share: float) -> F8:
     """Return the direction (3,) on which more than ``share`` of the directions agree.
 
-    ``up`` (n, 3) are the directions. The result is NaN if too few agree.
+    ``up`` (n, 3) are the directions; two agree if they differ by at most ``within_deg``. The result
+    is NaN if too few agree.
     """
     if len(up) < _FEWEST:
         return np.full(3, np.nan)
@@ -171,7 +173,7 @@ def _agreed(up: F8, within_deg: float, share: float) -> F8:
 
 
 def _cosine(a: F8, b: F8) -> F8:
-    """Return the cosines (n,) between directions (n, 3) and other directions, (n, 3) or (3,)."""
+    """Return the cosines (n,) between directions ``a`` (n, 3) and ``b``, (n, 3) or (3,)."""
     lengths = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
     return np.asarray((a * b).sum(axis=-1) / np.maximum(lengths, 1e-9))
 
@@ -181,6 +183,7 @@ def _cos(degrees: float) -> float:
 
 
 def _streams(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[str, _Stream]:
+    """Join the frames and planes tables of all segments to one stream per topic."""
     parts: dict[str, list[_Stream]] = {}
     for frames, planes in tables:
         for topic, part in _parts(frames, planes):

@@ -123,4 +123,5 @@ class UpCheck:
 
 
 def _angle_deg(a: F4, b: F4) -> float:
+    """Return the angle between two unit vectors (3,), degrees."""
     return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))

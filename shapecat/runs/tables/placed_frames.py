@@ -58,10 +58,15 @@ class DetectedFrames:
         return np.asarray(rows - self.first[self._find(rows)])
 
     def _find(self, rows: I4) -> I4:
+        """Return the rows (n,), in the frames table, of the frames of detections ``rows`` (n,)."""
         return np.asarray(np.searchsorted(self.first, rows, side="right") - 1)
 
 
 def _poses(frames: pa.Table, placed: Collection[str]) -> F8:
+    """Return the poses (f, 3, 4) from sensor to fixed frame, one per row of ``frames``.
+
+    They are the identity where the pose is unknown or the topic is not in ``placed``.
+    """
     result = np.tile(np.eye(3, 4), (frames.num_rows, 1, 1))
     turns = numbers_or_nan(frames["fixed_rotation"]).reshape(-1, 3, 3)
     topics, codes = topic_codes(frames)

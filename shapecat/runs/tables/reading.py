@@ -141,6 +141,7 @@ def read_together(
     """Yield the row groups of the same frames from several tables of a run folder.
 
     ``columns`` maps the names of the tables to the columns to read; None for all columns.
+    ``at_once`` is as in `read_row_groups`.
 
     Raises
     ------
@@ -284,6 +285,7 @@ def with_fixed_lists(table: pa.Table) -> pa.Table:
 
 
 def _open_parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
+    """Open a file; the columns ``read_dictionary`` are read as dictionaries."""
     try:
         return pq.ParquetFile(
             path, read_dictionary=list(read_dictionary), page_checksum_verification=True

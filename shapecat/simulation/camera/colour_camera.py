@@ -77,7 +77,8 @@ def _paint(
 ) -> U1:
     """Return the shaded colours (h, w, 3), uint8, of an image; textures move with their objects.
 
-    ``pose`` is ``world_from_camera``; the other parameters are as for `_colour_in`.
+    ``frame`` is the number of the frame, ``pose`` is ``world_from_camera``; the other parameters
+    are as for `_colour_in`.
     """
     supports = len(world.supports)
     poses = [pose] * supports  # from the camera to the frame of each texture
@@ -95,7 +96,7 @@ def _paint(
 
 
 def _texture(number: int, *, plain: bool) -> F8:
-    """Draw the texture (3, 3) of a mesh: two colours, 0 to 255, and its bands.
+    """Draw the texture (3, 3) of mesh ``number``: two colours, 0 to 255, and its bands.
 
     The last row is the direction across the bands, divided by their spacing, 1/m. The two colours
     of a ``plain`` texture are similar.

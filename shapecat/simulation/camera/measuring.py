@@ -91,7 +91,10 @@ def _inverse_depth_error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
 
 
 def _scaled_by_reflectance(cosine: F4, mesh_ids: I4, sensor: Sensor) -> F4:
-    """Return the cosines (h, w) of the incidence angles, times the reflectance of each mesh."""
+    """Return the cosines (h, w) of the incidence angles, times the reflectance of each mesh.
+
+    ``cosine`` (h, w) and ``mesh_ids`` (h, w) are as in `Image`.
+    """
     if sensor.log_reflectance_std <= 0 or mesh_ids.max(initial=-1) < 0:
         return cosine
     draws = np.random.default_rng((sensor.device, 2)).normal(
@@ -110,6 +113,7 @@ def _drop_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> Non
 
 
 def _drop_border(sensor: Sensor, lost: Bool) -> None:
+    """Mark the blank border of the sensor as ``lost`` (h, w)."""
     left, right, top, bottom = sensor.border_px
     lost[:top] = True
     lost[len(lost) - bottom :] = True
@@ -118,7 +122,7 @@ def _drop_border(sensor: Sensor, lost: Bool) -> None:
 
 
 def _drop_random_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
-    """Mark random holes as ``lost``."""
+    """Mark random holes as ``lost`` (h, w)."""
     area = 0.32 * (sensor.hole_px + 2) ** 2  # about the mean of width times height
     count = rng.poisson(sensor.holes * lost.size / area) if sensor.holes > 0 else 0
     rows = rng.integers(0, lost.shape[0], count)
@@ -129,7 +133,7 @@ def _drop_random_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
 
 
 def _smoothed_surfaces(inverse: F8, width: int) -> F8:
-    """Average the inverse depth over a window within each surface, which rounds its corners."""
+    """Average inverse depth (h, w) over windows within each surface, which rounds its corners."""
     for _ in range(2):  # along the rows, then along the columns
         along = np.zeros_like(inverse)
         _smooth(inverse, width // 2, along)
@@ -138,7 +142,10 @@ def _smoothed_surfaces(inverse: F8, width: int) -> F8:
 
 
 def _blended_edges(inverse: F8, width: int) -> F8:
-    """Mix near and far inverse depth at edges, as stereo windows and smoothing filters do."""
+    """Mix near and far inverse depth at edges, as stereo windows and smoothing filters do.
+
+    The inverse depth and the result are (h, w), 1/m; the window is ``width`` pixels wide.
+    """
     result = np.zeros_like(inverse)
     _blend(inverse, width // 2, result)
     return result
@@ -148,7 +155,9 @@ def _blended_edges(inverse: F8, width: int) -> F8:
 def _write_depth(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, mesh_ids: I4) -> None:
     """Add the error, quantize, and write the depth, metres; without depth, the mesh id becomes -1.
 
-    ``limits`` are the step of the inverse depth and the least and the greatest depth.
+    All arrays but ``limits`` are (h, w). ``inverse`` and ``error`` are in 1/m; ``lost`` pixels get
+    no depth. ``limits`` (3,): quantization step of the inverse depth (0: none), least and greatest
+    depth.
     """
     step, nearest, farthest = limits
     for v in range(inverse.shape[0]):
@@ -171,7 +180,8 @@ def _sample_beside(
 ) -> None:
     """Sample the image at displaced pixels into ``out``, ``ids_out`` and ``cos_out``.
 
-    ``across`` and ``down`` (h, w) are the displacements, pixels.
+    ``inverse``, ``mesh_ids`` and ``cosine`` (h, w) are the image; ``across`` and ``down`` (h, w)
+    are the displacements, pixels.
     """
     height, width = inverse.shape
     for v in range(height):
@@ -189,7 +199,7 @@ def _sample_beside(
 
 @kernel
 def _drop_margins(inverse: F8, width: int, lost: Bool) -> None:
-    """Mark pixels up to ``width`` rows and columns beside a nearer surface as ``lost``."""
+    """Mark as ``lost`` (h, w) pixels up to ``width`` rows and columns beside a nearer surface."""
     height, columns = inverse.shape
     nearest = np.zeros(inverse.shape)
     for v in range(height):
@@ -211,7 +221,8 @@ def _drop_margins(inverse: F8, width: int, lost: Bool) -> None:
 def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
     """Mark pixels whose points are occluded from a second viewpoint beside the camera.
 
-    ``shift`` is the viewpoint's x position in metres times the focal length in pixels.
+    ``inverse`` is the inverse depth, 1/m; the marks go to ``shadow``, both (h, w). ``shift`` is the
+    viewpoint's x position in metres times the focal length in pixels.
     """
     height, width = inverse.shape
     margin = int(abs(shift) * 5) + 2
@@ -241,7 +252,8 @@ def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
 def _fill_shadow(inverse: F8, mesh_ids: I4, shadow: Bool, growth_px: I4) -> None:
     """Extend the surface on the nearer side of a shadow into the shadow, as stereo matching does.
 
-    ``growth_px`` (h // 3 + 1, 16) holds the widths of the extension, which vary over the image.
+    ``inverse``, ``mesh_ids`` and ``shadow`` (h, w) are changed in place. ``growth_px`` (h // 3 + 1,
+    16) holds the widths of the extension, which vary over the image.
     """
     height, width = inverse.shape
     for v in range(height):
@@ -269,6 +281,10 @@ def _fill_shadow(inverse: F8, mesh_ids: I4, shadow: Bool, growth_px: I4) -> None
 
 @kernel
 def _blend(inverse: F8, radius: int, out: F8) -> None:
+    """Average the inverse depth (h, w) over a window at edges along rows; write it to ``out``.
+
+    The window extends ``radius`` pixels to each side. Elsewhere, the inverse depth is copied.
+    """
     height, width = inverse.shape
     for v in range(height):
         for u in range(width):
@@ -293,7 +309,7 @@ def _blend(inverse: F8, radius: int, out: F8) -> None:
 
 @kernel
 def _smooth(inverse: F8, radius: int, out: F8) -> None:
-    """Average along rows, up to ``radius`` pixels to each side, within one surface."""
+    """Average along rows, up to ``radius`` pixels to each side, within one surface, to ``out``."""
     height, width = inverse.shape
     for v in range(height):
         for u in range(width):

@@ -44,7 +44,7 @@ def noise(
 
 
 def _gain(width: int, times: int) -> float:
-    """Return the factor by which repeated sums over a window raise the standard deviation."""
+    """Return the factor by which ``times`` sums over a window raise the standard deviation."""
     weights = np.ones(1)
     for _ in range(times):
         weights = np.convolve(weights, np.ones(width))
@@ -70,6 +70,10 @@ def fixed_error(shape: tuple[int, int], deviation: float, spacing: int, device: 
 
 @kernel
 def _box_sum(raw: U1 | F4, wide: int, tall: int, out: F4) -> None:
+    """Write sums over windows, ``wide`` columns by ``tall`` rows, of ``raw`` to ``out`` (h, w).
+
+    ``raw`` is larger than ``out`` by the window, less one row and column.
+    """
     height, width = out.shape
     column = np.zeros(raw.shape[1], np.float32)
     for v in range(height):
@@ -87,6 +91,7 @@ def _box_sum(raw: U1 | F4, wide: int, tall: int, out: F4) -> None:
 
 @kernel
 def _interpolate(knots: F8, spacing: int, out: F4) -> None:
+    """Write to ``out`` (h, w) values between knots, ``spacing`` pixels apart, bilinearly."""
     height, width = out.shape
     for v in range(height):
         i = v // spacing

@@ -103,7 +103,7 @@ def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Cam
 
 
 def alone_pixels(scene: Geometry, mesh_id: int, camera: Camera, frame_from_camera: Pose) -> int:
-    """Count the pixels that a mesh would have if nothing occluded it.
+    """Count the pixels that mesh ``mesh_id`` would have if nothing occluded it.
 
     Pixels up to one image width or height beyond the image border count, too. The result is 0 if a
     vertex has a depth below `NEAR_M`. ``scene`` and ``frame_from_camera`` are as for `render`.
@@ -132,6 +132,7 @@ def alone_pixels(scene: Geometry, mesh_id: int, camera: Camera, frame_from_camer
 
 @kernel
 def _place(points: F8, rotation: F8, translation: F8, out: F8) -> None:
+    """Write points (n, 3), transformed by a rotation (3, 3) and a translation (3,), to ``out``."""
     for i in range(points.shape[0]):
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
         for k in range(3):
@@ -223,6 +224,11 @@ def _rasterize(
 def _shade(
     triangle_ids: I4, normals: F8, ids: I4, intrinsics: F8, mesh_ids: I4, cosine: F4
 ) -> None:
+    """Write mesh ids (-1 for none) and cosines of the angles of incidence, both (h, w).
+
+    ``triangle_ids`` (h, w) are from `_rasterize`, ``normals`` (m, 3) and mesh ids ``ids`` (m,)
+    those of the triangles; ``intrinsics`` are fx, fy, cx, cy.
+    """
     fx, fy, cx, cy = intrinsics
     for v in range(triangle_ids.shape[0]):
         y = (v - cy) / fy

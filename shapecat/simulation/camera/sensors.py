@@ -86,6 +86,7 @@ def interpolated(first: Sensor, second: Sensor, share: float) -> Sensor:
 
 
 def _mixed(first: Any, second: Any, share: float) -> Any:
+    """Return a value between two, of the same type; ``share`` is the fraction of the second."""
     mean = (1 - share) * np.asarray(first, float) + share * np.asarray(second, float)
     if isinstance(first, tuple):
         return tuple(np.rint(mean).astype(int).tolist())
@@ -113,4 +114,5 @@ def resized(sensor: Sensor, scale: float) -> Sensor:
 
 
 def _scaled(window: tuple[int, int], scale: float) -> tuple[int, int]:
+    """Return a window with ``scale`` times the width and height, of at least one pixel."""
     return max(round(window[0] * scale), 1), max(round(window[1] * scale), 1)

@@ -133,7 +133,10 @@ def _resting_arm(rng: Generator, start: F8, end: F8) -> list[Mesh]:
 
 
 def _links(joints: Sequence[F8], radii: Sequence[float]) -> list[Mesh]:
-    """Return a tube between consecutive joints, and a motor at each joint except the first."""
+    """Return a tube between consecutive joints, and a motor at each joint except the first.
+
+    ``joints`` are their positions (3,), ``radii`` those of the tubes, metres.
+    """
     parts = []
     for (start, end), radius in zip(pairwise(joints), radii, strict=True):
         ends = smooth_path(np.stack([start, end]), 6)
@@ -264,10 +267,11 @@ def make_keyboard(rng: Generator) -> Mesh:
 
 
 def _above(place: F8, height: float) -> F8:
+    """Return the position (3,) at ``height`` metres above another."""
     return np.asarray(place + np.array([0.0, 0.0, height]))
 
 
 def _put(mesh: Mesh, place: ArrayLike, degrees: float) -> Mesh:
-    """Turn a mesh about z and move it."""
+    """Turn a mesh about z and move it by ``place`` (3,), metres."""
     # A single step would round coordinates only once, and thus change recordings.
     return placed(placed(mesh, about="z", degrees=degrees), place)

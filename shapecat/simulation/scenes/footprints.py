@@ -75,6 +75,7 @@ def inside(points: F8, outline: F8, margin: float) -> bool:
 
 
 def _normals(outline: F8) -> F8:
+    """Return the outward unit normals (m, 2) of an outline (k, 2), without those of empty sides."""
     edge = np.roll(outline, -1, axis=0) - outline
     normals = np.stack([edge[:, 1], -edge[:, 0]], -1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -83,6 +84,7 @@ def _normals(outline: F8) -> F8:
 
 
 def _hull(points: F8) -> F8:
+    """Return the corners (k, 2) of the convex hull of points (n, 2), or the ends of a line."""
     spread = (
         np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) > 2 else [0]
     )

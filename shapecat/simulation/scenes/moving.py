@@ -121,6 +121,7 @@ def _strip(support: Support, x: tuple[float, float], y: tuple[float, float]) -> 
 
 
 def _shifted(track: int, along: F8) -> Motion:
+    """Return the motion of an object by the distances ``along`` (frames,) the x axis, metres."""
     return Motion(track, np.round(np.outer(along, [1.0, 0, 0]), 6))
 
 

@@ -98,6 +98,7 @@ def _ignore_warning(_: str) -> None:
 
 
 def _model(mujoco: Any, obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> Any:
+    """Return the model of fixed obstacles and of objects that wait far away to be dropped."""
     spec = mujoco.MjSpec()
     spec.option.timestep = _STEP_S
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -117,12 +118,14 @@ def _model(mujoco: Any, obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> Any
 
 
 def _add_solid(mujoco: Any, spec: Any, body: Any, name: str, corners: F8) -> Any:
+    """Add a convex solid with these ``corners`` (n, 3), metres, to a body; return it."""
     spec.add_mesh(name=name, uservert=np.asarray(corners, np.float64).reshape(-1))
     kind = mujoco.mjtGeom.mjGEOM_MESH
     return body.add_geom(type=kind, meshname=name, name=name, friction=_FRICTION, condim=6)
 
 
 def _extreme_points(mesh: Mesh) -> F8:
+    """Return the vertices (n, 3) of a mesh that are corners of its convex hull."""
     points = np.asarray(mesh.vertices, np.float64)
     return np.asarray(points[ConvexHull(points).vertices])
 

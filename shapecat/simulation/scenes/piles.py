@@ -151,8 +151,9 @@ def settled(
 ) -> tuple[PlacedObject, ...]:
     """Drop items onto supports; return the objects that come to rest on the support ``below``.
 
-    The objects are numbered from 0 in the order of ``items``. Objects that reach ``highest_m``
-    metres or more above the surface of ``below`` are left out, and so is all that rests on them.
+    The objects are numbered from 0 in the order of ``items``; ``drops`` says how each is dropped.
+    Objects that reach ``highest_m`` metres or more above the surface of ``below`` are left out, and
+    so is all that rests on them.
     """
     settled_poses = settle([support.mesh for support in supports], drops)
     stays = [
@@ -173,6 +174,7 @@ def settled(
 
 
 def _rests_on(mesh: Mesh, landed: SettledPose, below: Support, highest_m: float) -> bool:
+    """Return whether an object has come to rest above a support, and below ``highest_m``."""
     points = transform(landed.pose, mesh.vertices)
     low, high = points.min(axis=0), points.max(axis=0)
     edge = below.outline[:, :2]
@@ -188,6 +190,7 @@ def _placed_object(
     below: Support,
     tracks: F8,
 ) -> PlacedObject:
+    """Return an item where it has landed; ``tracks`` are the tracks of all items."""
     supported_by = landed.supported_by
     axes = landed.pose.rotation[2]  # world z of the object's own axes
     return PlacedObject(

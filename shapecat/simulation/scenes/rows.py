@@ -132,7 +132,11 @@ class _Groups:
     def _add(
         self, group: Sequence[_Place], corner: F8, turn: Pose, support: Support, shift_m: float
     ) -> None:
-        """Add the objects of a group; a few that carry nothing may be left out at random."""
+        """Add the objects of a group; a few that carry nothing may be left out at random.
+
+        ``corner`` (3,) is that of the group, metres, before it is turned. Each object is shifted at
+        random, by up to ``shift_m`` in x and y.
+        """
         rng, missing = self._rng, _MISSING * self._rng.integers(2)
         carrying = {place.below for place in group}
         tracks: dict[int | None, int] = {}
@@ -176,8 +180,8 @@ def _draw_row(
 ) -> list[_Place]:
     """Draw a row of objects of different sizes, aligned at the front, as books on a shelf.
 
-    ``gap`` is the distance between objects, metres. Objects taller than ``headroom_m`` are left
-    out.
+    ``count`` objects are drawn; ``gap`` is the distance between objects, metres. Objects taller
+    than ``headroom_m`` are left out.
     """
     row, along = [], 0.0
     for _ in range(count):

@@ -153,6 +153,7 @@ class World(Record):
 
     @cached_property
     def _shifts(self) -> dict[int, F8]:
+        """The displacements (frames, 3) of each moving object, metres, by track."""
         return {motion.track: motion.shifts for motion in self.motions}
 
     @cached_property

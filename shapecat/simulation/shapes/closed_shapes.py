@@ -35,6 +35,7 @@ def make_can(rng: Generator) -> Mesh:
 
 
 def _soda(rng: Generator, r: float, h: float) -> F8:
+    """Draw the profile (n, 2), radius and height, of a beverage can of this radius and height."""
     neck, foot = r * rng.uniform(0.78, 0.92), r * rng.uniform(0.7, 0.88)
     shoulder, sunk = h * rng.uniform(0.06, 0.12), rng.uniform(0.003, 0.007)
     return np.array(
@@ -57,6 +58,7 @@ def _soda(rng: Generator, r: float, h: float) -> F8:
 
 
 def _tin(rng: Generator, r: float, h: float) -> F8:
+    """Draw the profile (n, 2), radius and height, of a tin of this radius and height."""
     rim, sunk = rng.uniform(0.0, 0.0015), rng.uniform(0.0, 0.005)
     z = np.linspace(0.004, h - 0.004, 26)
     ribs = rng.uniform(0.0, 0.0012) * (rng.random() < 0.5)
@@ -68,6 +70,7 @@ def _tin(rng: Generator, r: float, h: float) -> F8:
 
 
 def _tube_can(rng: Generator, r: float, h: float) -> F8:
+    """Draw the profile (n, 2), radius and height, of a tube of this radius and height."""
     lid, over = h * rng.uniform(0.03, 0.12), r * rng.uniform(0.98, 1.06)
     return np.array(
         [
@@ -83,6 +86,7 @@ def _tube_can(rng: Generator, r: float, h: float) -> F8:
 
 
 def _jar(rng: Generator, r: float, h: float) -> F8:
+    """Draw the profile (n, 2), radius and height, of a jar of this radius and height."""
     lid, top = h * rng.uniform(0.1, 0.22), r * rng.uniform(0.84, 1.03)
     curve = rng.uniform(0.0, 0.006)
     z = np.linspace(0.1 * r, h - lid - 0.12 * r, 8)
@@ -94,6 +98,7 @@ def _jar(rng: Generator, r: float, h: float) -> F8:
 
 
 def _plain(rng: Generator, r: float, h: float) -> F8:
+    """Draw the profile (n, 2), radius and height, of a cylinder of this radius and height."""
     e = rng.uniform(0.0, 0.08) * min(r, h / 2)
     taper = rng.uniform(0.96, 1.0)
     t = r * taper
@@ -199,7 +204,10 @@ def _flattened(mesh: Mesh, stretch: float, low: float, high: float, neck: float)
 
 
 def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
-    """Shift the part above z = ``low`` to one side, as the neck of a detergent bottle."""
+    """Shift the part above z = ``low`` to one side, as the neck of a detergent bottle.
+
+    The shift is ``shift`` from z = ``high`` on, metres, and grows smoothly from ``low``.
+    """
     points = np.array(mesh.vertices, np.float64)
     t = np.clip((points[:, 2] - low) / (high - low), 0, 1)
     points[:, 0] += shift * t * t * (3 - 2 * t)
@@ -207,7 +215,7 @@ def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
 
 
 def _pump(rng: Generator, radius: float, height: float) -> list[Mesh]:
-    """Return the head of a lotion pump: a stem with a spout."""
+    """Return the head of a lotion pump, a stem with a spout, for a bottle of this size."""
     stem = rng.uniform(0.02, 0.045)
     thick = float(np.clip(0.35 * radius, 0.003, 0.006))
     z = height + stem
@@ -220,7 +228,7 @@ def _pump(rng: Generator, radius: float, height: float) -> list[Mesh]:
 
 
 def _trigger(rng: Generator, radius: float, height: float) -> list[Mesh]:
-    """Return the head of a spray bottle: a box with a nozzle and a lever."""
+    """Return the head of a spray bottle of this size: a box with a nozzle and a lever."""
     long, tall = radius * rng.uniform(1.2, 1.9), rng.uniform(0.022, 0.035)
     thick = rng.uniform(0.018, 0.026)
     head = rounded_box([long, thick, tall], radius=0.004, fine=2)

@@ -77,6 +77,7 @@ def _samples(mesh: Mesh) -> F8:
 
 
 def _blocks(points: F8) -> Iterator[F8]:
+    """Yield the corners (k, 3) of the points (n, 3) in each block of a grid, thickened."""
     low = points.min(axis=0)
     side = np.maximum((points.max(axis=0) - low) / _BLOCKS, 4 * _SKIN_M)
     cell = np.minimum(((points - low) / side).astype(int), _BLOCKS - 1)
@@ -101,7 +102,7 @@ def _thickened(points: F8) -> F8:
 
 
 def _corners(points: F8, directions: F8) -> F8:
-    """Return the point that is farthest along each direction, without duplicates: (k, 3)."""
+    """Return the point of ``points`` farthest along each direction, without duplicates: (k, 3)."""
     return np.asarray(points[np.unique((points @ directions.T).argmax(axis=0))])
 
 

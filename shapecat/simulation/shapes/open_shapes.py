@@ -141,7 +141,8 @@ def _wall(shares: ArrayLike, radius: float, height: float, *, power: float) -> F
 def _foot(rng: Generator, chance: float, tallest: float) -> tuple[float, float]:
     """Draw a foot ring: its radius relative to the bottom's radius, and its height in metres.
 
-    With probability 1 - ``chance`` there is none, and the height is 0.
+    With probability 1 - ``chance`` there is none, and the height is 0; else it is at most
+    ``tallest``.
     """
     if rng.random() >= chance:
         return 1.0, 0.0
@@ -214,6 +215,10 @@ def _handle_shape(rng: Generator, diameter: float, height: float) -> tuple[F8, f
 
 
 def _handle(outer: F8, shape: tuple[F8, float, float], wall: float, side: float) -> Mesh:
+    """Return a handle at the angle ``side``, radians, of a wall ``wall`` metres thick.
+
+    ``outer`` (k, 2) is the radius and the height of its outside; ``shape`` is from `_handle_shape`.
+    """
     curve, radius, flatness = shape
     height = curve[:, 1] + outer[-1, 1] / 2
     ends = np.interp(height[[0, -1]], outer[:, 1], outer[:, 0]) - 0.5 * wall

@@ -100,7 +100,10 @@ def tube(
 
 
 def _across(path: F8, along: F8) -> F8:
-    """Return unit vectors (k, 3) perpendicular to a path, with minimal rotation along it."""
+    """Return unit vectors (k, 3) perpendicular to a path, with minimal rotation along it.
+
+    ``path`` (k, 3) are its points, ``along`` (k, 3) its unit directions.
+    """
     spread = np.linalg.svd(path - path.mean(axis=0), full_matrices=False)[2]
     start = spread[-1] if abs(spread[-1] @ along[0]) < 0.9 else spread[0]
     if start[np.argmax(np.abs(start))] < 0:  # the sign of a singular vector is free
@@ -170,6 +173,7 @@ def rounded_box(size: ArrayLike, *, radius: float = 0.0, bulge: float = 0.0, fin
 
 
 def _box_lines(half: float, radius: float, fine: int) -> F8:
+    """Return the coordinates (n,) of the grid lines on a face, dense where the edges are round."""
     flat = np.linspace(radius - half, half - radius, fine + 1)
     if radius <= 0:
         return flat

@@ -86,7 +86,10 @@ def _roundness(points: F8) -> float:
 
 
 def _narrow_end(points: F8, triangles: I4) -> float:
-    """Return a positive number if the upper half is narrower than the lower half, else <= 0."""
+    """Return a positive number if the upper half is narrower than the lower half, else <= 0.
+
+    ``points`` (n, 3) and ``triangles`` (m, 3) are those of the mesh.
+    """
     low, high = points[:, 2].min(), points[:, 2].max()
     levels = np.linspace(low, high, 18)[1:-1]
     areas = [_slice_area(points[triangles], float(z)) for z in levels]
@@ -107,7 +110,8 @@ def _slice_area(corners: F8, z: float) -> float:
 def _hollow(points: F8, mesh: Mesh) -> float:
     """Return how deep the central surface, seen from above, lies below the top.
 
-    The depth is a median over the pixels, divided by the largest absolute x or y.
+    ``points`` (n, 3) are the vertices of the mesh, turned. The depth is a median over the pixels,
+    divided by the largest absolute x or y.
     """
     turned = Mesh(points, mesh.triangles)
     distance = 40 * float(np.abs(points).max())

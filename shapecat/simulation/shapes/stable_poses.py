@@ -78,7 +78,10 @@ def _centre_of_mass(corners: F8, origin: F8) -> F8:
 
 
 def _inside(corners: F8, normals: F8, foot: F8) -> F8:
-    """Return whether each point of ``foot`` (k, 3) lies in its triangle, with a small tolerance."""
+    """Return whether each point of ``foot`` (k, 3) lies in its triangle, with a small tolerance.
+
+    ``corners`` (k, 3, 3) and ``normals`` (k, 3) are those of the triangles; the result is (k,).
+    """
     signs = []
     for k in range(3):
         a, b = corners[:, k], corners[:, (k + 1) % 3]
