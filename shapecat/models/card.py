@@ -29,8 +29,9 @@ partial views of known categories.
   sight.
 - Accuracy falls with the resolution, most of all for small objects beyond 1.4 m and lying objects.
 - Some categories differ by a definition: plate, bowl and cup by depth / diameter (limits 0.2 and
-  0.65), bottle and can by a neck clearly narrower than the body. Objects near such a limit may get
-  either category.
+  0.65), bottle and can by a neck clearly narrower than the body. A ball may be a round fruit, 0.75
+  to 1.4 times as long as wide: an apple, a lemon. Objects near such a limit may get either
+  category.
 - Cartons with a gable or a screw cap are between box and bottle.
 - Mostly hidden objects are categorized by their visible part.
 
@@ -39,7 +40,7 @@ partial views of known categories.
 On simulated objects the confidence is calibrated: of the objects with a confidence of 0.8, about
 80 % have the right category. In real clutter it is too high, mostly for shapes of no category.
 In real recordings with labels, 45 detections of a known category had a confidence of at least 0.9:
-28 were right, and 15 of the 17 others were *unknown* shapes.
+30 were right, and 14 of the 15 others were *unknown* shapes.
 
 ## The worst mistakes
 
