@@ -45,7 +45,7 @@ def test_wall_in_image_corner_is_no_object(seed: int) -> None:
     assert scene_labels("empty", seed)[1] == []
 
 
-@pytest.mark.parametrize("seed", [313, 336, 581])
+@pytest.mark.parametrize("seed", [313, 581])
 def test_edge_on_side_of_shelf_is_no_object(seed: int) -> None:
     """It is too narrow in the image to fit a wall, and cut by a board or the border."""
     assert all(np.median(candidate) >= FIRST_OBJECT for candidate in scene_labels("shelf", seed)[1])
