@@ -15,8 +15,9 @@ from shapecat.simulation.scenes.furniture import make_table
 from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.simulation.scenes.physics import Drop, SettledPose, settle
 from shapecat.simulation.scenes.worlds import World
+from shapecat.simulation.shapes.balls import make_ball
 from shapecat.simulation.shapes.categories import make_object
-from shapecat.simulation.shapes.closed_shapes import make_ball, make_box
+from shapecat.simulation.shapes.closed_shapes import make_box
 from shapecat.simulation.shapes.convex_parts import convex_parts, hollowness
 from shapecat.simulation.shapes.mesh import Mesh
 from shapecat.simulation.shapes.primitives import lathe, rounded_box

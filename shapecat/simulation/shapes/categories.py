@@ -2,7 +2,8 @@
 
 from numpy.random import Generator
 
-from shapecat.simulation.shapes.closed_shapes import make_ball, make_bottle, make_box, make_can
+from shapecat.simulation.shapes.balls import make_ball
+from shapecat.simulation.shapes.closed_shapes import make_bottle, make_box, make_can
 from shapecat.simulation.shapes.mesh import Mesh
 from shapecat.simulation.shapes.open_shapes import make_bowl, make_cup, make_plate
 
