@@ -131,4 +131,4 @@ def test_delays_are_kept_all_over_a_long_recording() -> None:
 
     assert len(delays._delays) <= 1000
     np.testing.assert_allclose(delays.at(EPOCH + times * MS), 7 * times, atol=1)
-    assert not Delays()
+    assert Delays().all_zero

@@ -1,12 +1,12 @@
 """Find a usable calibration of a camera: some drivers publish zeros before they know it."""
 
 from contextlib import suppress
-from itertools import islice
 from typing import Any
 
-from shapecat.recordings.messages import MALFORMED, MessageError
+from shapecat.recordings.messages import MALFORMED
 from shapecat.recordings.pinhole import has_intrinsics
 from shapecat.recordings.recording import Recording
+from shapecat.recordings.streams import first_messages
 
 __all__ = ["first_calibration"]
 
@@ -20,9 +20,8 @@ def first_calibration(recording: Recording, topic: str) -> Any:
     If none of the first few hundred has, return the first one; None if none can be decoded.
     """
     first = None
-    for message in islice(recording.messages([topic]), _SEARCHED):
-        with suppress(MessageError, *MALFORMED):
-            info = recording.decode(message)
+    for info in first_messages(recording, topic, most=_SEARCHED):
+        with suppress(*MALFORMED):
             if has_intrinsics(info):
                 return info
             first = info if first is None else first

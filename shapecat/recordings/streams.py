@@ -217,13 +217,15 @@ def first_message(recording: Recording, topic: str) -> Any:
     return next(first_messages(recording, topic), None)
 
 
-def first_messages(recording: Recording, topic: str, kind: str | None = None) -> Iterator[Any]:
-    """Yield those of a topic's first few messages that can be decoded.
+def first_messages(
+    recording: Recording, topic: str, kind: str | None = None, *, most: int = _PEEK
+) -> Iterator[Any]:
+    """Yield those of a topic's first ``most`` messages that can be decoded.
 
     ``kind`` is the type of these messages; None for any type.
     """
     of_type = (m for m in recording.messages([topic]) if kind is None or m.type == kind)
-    for message in islice(of_type, _PEEK):
+    for message in islice(of_type, most):
         with suppress(MessageError):
             yield recording.decode(message)
 

@@ -82,13 +82,12 @@ function order() {
 // Count the tracks as count_cards in cards.py does: merged ones once, deleted ones not.
 function recount() {
   const tracks = cards.map((card) => card.dataset.track);
-  const unsure = (card) => card.dataset.category === "unknown" || Number(card.dataset.confidence) < 0.8;
   const objects = [...new Set(tracks.map(shownTrack))].filter((track) => labelOf(track) !== "delete");
   const counts = new Map([...byId("categories").children].map((chip) => [chip.dataset.category, 0]));
   for (const name of objects.map(categoryOf)) counts.set(name, (counts.get(name) || 0) + 1);
   for (const [name, count] of counts) chipOf(name).querySelector("b").textContent = count;
   showTile("tracks", objects.length);
-  showTile("uncertain", cards.filter((card) => labels.get(card.dataset.track) === "" && unsure(card)).length);
+  showTile("uncertain", cards.filter((card) => labels.get(card.dataset.track) === "" && card.dataset.unsure).length);
 }
 
 // Return the filter of a category; make one for a new category.

@@ -92,6 +92,7 @@ def card_html(card: Card, categories: Sequence[str], names: Sequence[str], end: 
         category=escape(row.category),
         guess=_guess(row),
         value=f"{row.confidence:.4g}",
+        unsure="1" if _is_unsure(row) else "",
         first=f"{line.seconds[0] if len(line.seconds) else 0.0:.4g}",
         colour=hex_colour(row.category),
         confidence=confidence_text(row.confidence),

@@ -32,9 +32,10 @@ class Delays:
             self._step *= 2
         return kept
 
-    def __bool__(self) -> bool:
-        """Return whether any delay is other than 0: else the log times may be copies of stamps."""
-        return any(self._delays)
+    @property
+    def all_zero(self) -> bool:
+        """Whether all delays are 0, or there are none: log times may be copies of the stamps."""
+        return not any(self._delays)
 
     def at(self, log_times_ns: I4) -> F8:
         """Interpolate the delays at log times (n,); nanoseconds."""

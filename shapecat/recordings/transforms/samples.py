@@ -26,8 +26,9 @@ published rarely has no gaps."""
 _LONGEST_NS = 10_000_000_000
 """Longer intervals count as this long in the mean: what lies between may not have been read."""
 _MOVED_M = 0.02
-"""If the samples around a gap are nearer than this and `_TURNED`, they are interpolated: the frame
-was at rest, as in transforms that are published only on change, or localization corrected it."""
+"""Samples that differ by less than this and `_TURNED` are close. Those around a gap are then
+interpolated: the frame was at rest, as in transforms that are published only on change, or
+localization corrected it."""
 _TURNED = math.radians(1)
 
 
@@ -46,7 +47,7 @@ class TransformTrack:
     ----------
     delays : the delays of the samples, which need not be sorted by stamp.
     latched : whether the last transform remains valid for ever.
-    moves : whether some samples differ by more than noise.
+    moves : whether a sample is not close to the first one; see `_MOVED_M`.
     static : the static transform, valid when no other one is; None if there is none.
     stamps : stamps of the samples, nanoseconds.
     """
@@ -134,7 +135,7 @@ def pose_of(sample: TransformSample) -> Pose:
 
 
 def _are_close(a: TransformSample, b: TransformSample) -> bool:
-    """Return whether two samples are the same, but for noise."""
+    """Return whether two samples differ by less than `_MOVED_M` and `_TURNED`."""
     cosine = abs(sum(p * q for p, q in zip(a.quaternion, b.quaternion, strict=True)))
     return (
         a.parent == b.parent

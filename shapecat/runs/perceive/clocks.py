@@ -62,7 +62,8 @@ def explain_transform_clocks(
     )
     for topic, (stamps, log_times) in ((topic, both.T) for topic, both in logs.items()):
         delays, frame_id = log_times - stamps, frame_ids[topic]
-        clocks = [clock for clock in transforms.delays_between(fixed_frame, frame_id) if clock]
+        clocks = transforms.delays_between(fixed_frame, frame_id)
+        clocks = [clock for clock in clocks if not clock.all_zero]
         if not clocks or not delays.any():  # without stamps, log times replace them
             continue
         behind = [float(np.median(delays - clock.at(log_times))) * 1e-9 for clock in clocks]

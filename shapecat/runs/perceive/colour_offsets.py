@@ -3,12 +3,10 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F8
-from shapecat.runs.perceive.misplacement import APART_S, GAP_S, moved_m
+from shapecat.runs.perceive.misplacement import APART_S, GAP_S, Centers, moved_m
 from shapecat.runs.tables.reading import (
     frame_rows,
     keys_of,
@@ -30,14 +28,6 @@ _MIN_MOTIONS = 3
 """Minimum number of comparisons on which the speed of objects is based."""
 
 
-class _Centers(NamedTuple):
-    """The centres (n, 3) of a frame's objects; ``fixed`` is NaN if the pose is unknown."""
-
-    stamp_ns: int
-    sensor: F8
-    fixed: F8
-
-
 @dataclass
 class _Stream:
     """The colour images of a depth stream.
@@ -51,9 +41,9 @@ class _Stream:
 
     offsets_s: list[float] = field(default_factory=list)
     speeds: list[float] = field(default_factory=list)
-    compared: _Centers | None = None
+    compared: Centers | None = None
 
-    def compare(self, centers: _Centers) -> None:
+    def compare(self, centers: Centers) -> None:
         """Measure the motion of the objects in a frame since the last compared one."""
         if not len(centers.sensor):
             return
@@ -119,7 +109,7 @@ def _read(folder: Path) -> dict[str, _Stream]:
         for key, stamp in zip(keys_of(frames), numbers(frames["stamp_ns"]).tolist(), strict=True):
             stream = streams.setdefault(key[0], _Stream())
             span = rows.get(key, slice(0, 0))
-            stream.compare(_Centers(stamp, in_sensor[span], in_fixed[span]))
+            stream.compare(Centers(stamp, in_sensor[span], in_fixed[span]))
             if key in colour_ns:
                 stream.offsets_s.append(abs(colour_ns[key] - stamp) * 1e-9)
     return streams

@@ -16,7 +16,7 @@ from shapecat.runs.tables.reading import (
     read_together,
 )
 
-__all__ = ["APART_S", "GAP_S", "explain_misplacement", "moved_m"]
+__all__ = ["APART_S", "GAP_S", "Centers", "explain_misplacement", "moved_m"]
 
 APART_S = 0.3
 """Minimum time between two compared frames, so that even a slow camera has moved."""
@@ -33,8 +33,11 @@ _WORSE_SHARE = 0.7
 """Minimum fraction of the comparisons in which poses are worse than none."""
 
 
-class _Centers(NamedTuple):
-    """The centres (n, 3) of a frame's objects, relative to the sensor and in the fixed frame."""
+class Centers(NamedTuple):
+    """The centres (n, 3) of a frame's objects, metres, in the sensor frame and the fixed frame.
+
+    ``fixed`` is NaN if the pose of the sensor is unknown.
+    """
 
     stamp_ns: int
     sensor: F8
@@ -66,7 +69,7 @@ def _compare(folder: Path) -> dict[str, list[bool]]:
 
     Poses are worse if objects move much farther in the fixed frame than relative to the sensor.
     """
-    latest: dict[str, _Centers] = {}
+    latest: dict[str, Centers] = {}
     worse: dict[str, list[bool]] = {}
     columns = ["topic", "frame"]
     selected = {
@@ -80,7 +83,7 @@ def _compare(folder: Path) -> dict[str, list[bool]]:
         )
         for key, stamp in zip(keys_of(frames), numbers(frames["stamp_ns"]).tolist(), strict=True):
             span = rows.get(key, slice(0, 0))
-            centers = _Centers(stamp, in_sensor[span], in_fixed[span])
+            centers = Centers(stamp, in_sensor[span], in_fixed[span])
             if not len(centers.fixed) or np.isnan(centers.fixed).any():
                 continue
             previous = latest.setdefault(key[0], centers)
