@@ -71,7 +71,7 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
         if parent[k] == k:
             n += 1
             sizes[n] = size[k]
-            size[k] = n  # from here on, the final label
+            size[k] = n  # reused for the final label
         else:
             size[k] = size[parent[k]]
     size[0] = 0

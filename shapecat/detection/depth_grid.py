@@ -179,7 +179,8 @@ def find_borders(inv_depth: F4, band: int) -> I4:
     Parameters
     ----------
     inv_depth : (rows, columns) 1/m.
-    band : number of lines, from the first with a sample on, that show whether a border is straight.
+    band : number of lines, beginning with the first with a sample, that show whether a border is
+        straight.
 
     Returns
     -------

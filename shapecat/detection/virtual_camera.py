@@ -198,7 +198,7 @@ def _rotation_to(axis: F8) -> F8:
 
 
 def _render(in_view: F4, slopes: F4, bounds: F8, n: int, pose: Pose) -> VirtualImage:
-    """Return the image of points; ``pose`` maps their original frame to that of the virtual camera.
+    """Return the image of points; ``pose`` is its ``view_from_sensor``.
 
     ``in_view``, ``slopes`` and ``bounds`` are from `_to_view`; ``n`` is the number of points in
     view.

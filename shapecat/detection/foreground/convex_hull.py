@@ -12,22 +12,22 @@ __all__ = ["fill_hull"]
 
 
 @kernel(inline=True)
-def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
+def fill_hull(residual: F4, part: I4, cells: I4, count: int) -> int:
     """Add to a part the low cells within its convex hull; return its new number of cells.
 
     Parameters
     ----------
     residual : (rows, columns) not 0 in low cells.
     part : (rows, columns) numbers of the parts, changed in place.
-    stack, count : the first ``count`` elements of ``stack`` are the flat indices of the part's
+    cells, count : the first ``count`` elements of ``cells`` are the flat indices of the part's
         cells; those of the added cells are appended.
     """
     rows, columns = residual.shape
     parts = part.reshape(-1)
-    label = parts[stack[0]]
+    label = parts[cells[0]]
     left, right = np.full(rows, float(columns)), np.full(rows, -1.0)
     for t in range(count):
-        i, j = row_and_column(stack[t], columns)
+        i, j = row_and_column(cells[t], columns)
         left[i], right[i] = min(left[i], j), max(right[i], j)
     first, last = 0, rows - 1
     while right[first] < 0:
@@ -42,7 +42,7 @@ def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
     for i in range(first, last + 1):
         for j in range(math.ceil(left[i] - 1e-6), math.floor(1e-6 - right[i]) + 1):
             if part[i, j] != label and residual[i, j] != 0:
-                stack[top] = i * columns + j
+                cells[top] = i * columns + j
                 part[i, j] = label
                 top += 1
     return top

@@ -97,7 +97,7 @@ def _find_low(
 
 @kernel
 def clear_contact(
-    inv_depth: F4, heights: HeightMap, number: int, jump: float, residual: F4, stack: I4, drop: F4
+    inv_depth: F4, heights: HeightMap, number: int, jump: float, residual: F4, queue: I4, drop: F4
 ) -> None:
     """Set the residual to 0 where the low cells at the foot of a higher object are steep.
 
@@ -110,7 +110,7 @@ def clear_contact(
     number : number of the plane, from 1, as in `HeightMap.plane_id`.
     jump : largest change from cell to cell on the side of an object, 1/m.
     residual : (rows, columns) 1/m, changed in place.
-    stack, drop : (cells,) work space.
+    queue, drop : (rows * columns,) work space.
     """
     (rows, columns), (plane_id, height) = residual.shape, heights
     tail = 0
@@ -133,18 +133,18 @@ def clear_contact(
             continue
         for j in range(1, columns - 1):
             if edge[j]:
-                stack[tail], drop[tail] = i * columns + j, np.inf
+                queue[tail], drop[tail] = i * columns + j, np.inf
                 tail += 1
     head = 0
     while head < tail:
-        i, j = stack[head] // columns, stack[head] % columns
+        i, j = queue[head] // columns, queue[head] % columns
         level = drop[head]
         head += 1
         for di, dj in SIDES:
             y, x = i + di, j + dj
             falls = residual[y, x] != 0 and level - residual[y, x] > LOW.slope
             if falls and abs(inv_depth[y, x] - inv_depth[i, j]) < jump:
-                stack[tail], drop[tail] = y * columns + x, residual[y, x]
+                queue[tail], drop[tail] = y * columns + x, residual[y, x]
                 residual[y, x] = 0
                 tail += 1
 

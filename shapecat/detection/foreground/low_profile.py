@@ -39,13 +39,13 @@ class Scratch(NamedTuple):
     ----------
     flooded : (rows, columns) int32, the number of the last part that was flooded at each cell.
     part : (rows, columns) int32, the number of the last part whose filled hull holds each cell.
-    seeds, stack : (cells,) int32, lists of flat cell indices.
+    seeds, cells : (rows * columns,) int32, lists of flat cell indices.
     """
 
     flooded: I4
     part: I4
     seeds: I4
-    stack: I4
+    cells: I4
 
 
 @kernel
@@ -82,7 +82,7 @@ def find_low_profile(
         start, end = _rows_of(plane_id, number)
         if start == end:
             continue
-        plane = np.array([a, b, planes[k].c + start * b])  # rows count from ``start`` from here on
+        plane = np.array([a, b, planes[k].c + start * b])  # below, row 0 is row ``start``
         values, plane_ids, marks = inv_depth[start:end], plane_id[start:end], object_ids[start:end]
         residual, high_pass = residuals[start:end], high_passes[start:end]
         above = HeightMap(plane_ids, height[start:end])
@@ -146,7 +146,7 @@ def _mark_objects(
     `measure_outline`.
     """
     flat, marks, plane_ids = high_pass.reshape(-1), object_ids.reshape(-1), plane_id.reshape(-1)
-    flooded, part, seeds, stack = scratch
+    flooded, part, seeds, cells = scratch
     visited, part_of = flooded.reshape(-1), part.reshape(-1)
     n = _find_seeds(high_pass, limits.level * LOW.levels[-1], seeds)
     merits = np.zeros(1 + objects + len(LOW.levels) * (flat.size // LOW.min_cells), np.float32)
@@ -157,30 +157,30 @@ def _mark_objects(
             if visited[s] > first or not flat[s] > level:
                 continue
             parts += 1
-            count = _flood(high_pass, level, s, parts, flooded, stack)
+            count = _flood(high_pass, level, s, parts, flooded, cells)
             if count < LOW.min_cells:
                 continue
             overlap, best_merit = 0, 0.0
-            for p in stack[:count]:
+            for p in cells[:count]:
                 part_of[p] = parts
                 overlap += marks[p] > 0
                 best_merit = max(best_merit, merits[marks[p]])
             if (
                 overlap > LOW.max_overlap * count
-                or width_of_part(inv_depth, stack, count) > limits.width
+                or width_of_part(inv_depth, cells, count) > limits.width
             ):
                 continue
-            filled = fill_hull(high_pass, part, stack, count)
+            filled = fill_hull(high_pass, part, cells, count)
             outline = measure_outline(
-                inv_depth, high_pass, plane_id, part, stack, filled, number, limits
+                inv_depth, high_pass, plane_id, part, cells, filled, number, limits
             )
-            for p in stack[count:filled]:
+            for p in cells[count:filled]:
                 best_merit = max(best_merit, merits[marks[p]])
             merit = outline.rise / outline.sides
             if merit > LOW.grown * best_merit and is_object(outline, filled):
                 objects += 1
                 merits[objects] = merit
-                for p in stack[:filled]:
+                for p in cells[:filled]:
                     marks[p], plane_ids[p] = objects, number
     return objects, parts
 
@@ -189,9 +189,9 @@ def _mark_objects(
 def _find_seeds(high_pass: F4, threshold: float, seeds: I4) -> int:
     """List the cells above ``threshold`` that are higher than their left and upper neighbours.
 
-    The first cell of every part above any level is among them. Writes flat indices to ``seeds``;
-    returns their number. ``high_pass`` (rows, columns) is from `filter_high_pass`. Most cells are
-    below ``threshold``, so a vectorised test skips whole blocks.
+    At ``threshold`` and every higher level, the first cell of each part above the level is listed.
+    Writes flat indices to ``seeds``; returns their number. ``high_pass`` (rows, columns) is from
+    `filter_high_pass`. Most cells are below ``threshold``, so a vectorised test skips whole blocks.
     """
     rows, columns = high_pass.shape
     flat = high_pass.reshape(-1)
@@ -219,26 +219,26 @@ def _find_seeds(high_pass: F4, threshold: float, seeds: I4) -> int:
 
 
 @kernel(inner=True)
-def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) -> int:
+def _flood(residual: F4, level: float, start: int, n: int, part: I4, cells: I4) -> int:
     """Set ``part`` to ``n`` in the cells above ``level`` that are connected with ``start``.
 
-    Lists these cells in ``stack`` and returns their number. ``start`` is a flat index; ``residual``
+    Lists these cells in ``cells`` and returns their number. ``start`` is a flat index; ``residual``
     (rows, columns), 1/m, must be 0 at the border of the image; ``part`` is (rows, columns),
-    ``stack`` (rows * columns,).
+    ``cells`` (rows * columns,).
     """
     columns = residual.shape[1]
     flat, parts = residual.reshape(-1), part.reshape(-1)
-    stack[0] = start
+    cells[0] = start
     parts[start] = n
     head, tail = 0, 1
     while head < tail:
-        p = stack[head]
+        p = cells[head]
         head += 1
         for step in (1, -1, columns, -columns):
             q = np.uint64(p + step)  # unsigned: no check for negative indices
             new = (parts[q] != n) & (flat[q] > level)
             parts[q] = n if new else parts[q]  # a branch would be unpredictable
-            stack[tail] = q
+            cells[tail] = q
             tail += int(new)
     return tail
 
@@ -261,7 +261,7 @@ def _drop_error(
     `measure_outline`.
     """
     rows, columns = residual.shape
-    _, part, seeds, stack = scratch
+    _, part, seeds, cells = scratch
     above = np.zeros(residual.shape, np.float32)
     n = 0
     for i in range(rows):
@@ -282,13 +282,13 @@ def _drop_error(
         if part_of[s] > first:
             continue
         parts += 1
-        count = _flood(above, np.float32(0), s, parts, part, stack)
+        count = _flood(above, np.float32(0), s, parts, part, cells)
         if count < LOW.small_part:
             continue
-        line = measure_outline(inv_depth, residual, plane_id, part, stack, count, number, limits)
+        line = measure_outline(inv_depth, residual, plane_id, part, cells, count, number, limits)
         if line.table >= LOW.facing_share * line.sides and line.rise < line.table:
             for t in range(count):
-                plane_ids[stack[t]] = -number
+                plane_ids[cells[t]] = -number
     return parts
 
 

@@ -51,18 +51,18 @@ class Outline(NamedTuple):
 
 
 @kernel(inline=True)
-def width_of_part(inv_depth: F4, stack: I4, count: int) -> float:
+def width_of_part(inv_depth: F4, cells: I4, count: int) -> float:
     """Return the width of a part along the rows, in cells at a depth of 1 m.
 
-    ``inv_depth`` is (rows, columns), 1/m; the first ``count`` elements of ``stack`` are the flat
+    ``inv_depth`` is (rows, columns), 1/m; the first ``count`` elements of ``cells`` are the flat
     indices of the part's cells.
     """
     columns = inv_depth.shape[1]
     first, last = columns, 0
-    for p in stack[:count]:
+    for p in cells[:count]:
         _, j = row_and_column(p, columns)
         first, last = min(first, j), max(last, j)
-    return float((last - first) / inv_depth[stack[0] // columns, stack[0] % columns])
+    return float((last - first) / inv_depth[cells[0] // columns, cells[0] % columns])
 
 
 @kernel(inline=True)
@@ -85,7 +85,7 @@ def measure_outline(
     residual: F4,
     plane_id: I4,
     part: I4,
-    stack: I4,
+    cells: I4,
     count: int,
     number: int,
     limits: Limits,
@@ -99,7 +99,7 @@ def measure_outline(
         low (`LowProfileSettings.low_m`).
     plane_id : (rows, columns) as in `HeightMap`.
     part : (rows, columns) numbers of the parts.
-    stack, count : the first ``count`` elements of ``stack`` are the flat indices of this part's
+    cells, count : the first ``count`` elements of ``cells`` are the flat indices of this part's
         cells.
     number : number of the plane, from 1, as in ``plane_id``.
     limits : the limits for parts of this plane.
@@ -109,9 +109,9 @@ def measure_outline(
     jump = limits.discontinuity
     sides = table = bounded = hidden = steep = 0
     rise, outward = 0.0, LOW.rise_cells - OUTLINES.inward
-    label = parts[stack[0]]
+    label = parts[cells[0]]
     for t in range(count):
-        p = stack[t]
+        p = cells[t]
         beside = (parts[p - 1] == label) & (parts[p + 1] == label)
         if beside & (parts[p - columns] == label) & (parts[p + columns] == label):
             continue

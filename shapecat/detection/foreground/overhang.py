@@ -62,7 +62,7 @@ def extend_overhang(
     max_height_m : maximum height of an object above its plane, metres.
     """
     shape = grid.inverse_depth.shape
-    visited, stack = np.zeros(shape, np.int8), unset(grid.inverse_depth.size, np.int32)
+    visited, cells = np.zeros(shape, np.int8), unset(grid.inverse_depth.size, np.int32)
     border = np.zeros(shape[1], np.uint8)
     for number in range(len(planes), 0, -1):
         over = Overhang(grid, heights, walls, number, planes[number - 1], max_height_m, visited)
@@ -71,7 +71,7 @@ def extend_overhang(
                 continue
             for j in range(shape[1]):
                 if border[j] and visited[i, j] != number and _continues(over, i, j):
-                    _extend(over, i, j, stack)
+                    _extend(over, i, j, cells)
 
 
 @kernel(inline=True)
@@ -118,17 +118,17 @@ def _continues(over: Overhang, i: int, j: int) -> bool:
 
 
 @kernel(inline=True)
-def _extend(over: Overhang, i: int, j: int, stack: I4) -> None:
+def _extend(over: Overhang, i: int, j: int, cells: I4) -> None:
     """Assign the outside part of the object at cell (i, j) to the plane, unless it is too large.
 
-    ``stack`` (rows * columns,) is work space.
+    ``cells`` (rows * columns,) is work space.
     """
     inv_depth, plane_id, number = over.grid.inverse_depth, over.heights.plane_id, over.number
     rows, columns = inv_depth.shape
-    stack[0], over.visited[i, j] = i * columns + j, number
+    cells[0], over.visited[i, j] = i * columns + j, number
     head, tail, outside = 0, 1, 0
     while head < tail:
-        i, j = row_and_column(stack[head], columns)
+        i, j = row_and_column(cells[head], columns)
         head += 1
         for di, dj in SIDES:
             y, x = i + di, j + dj
@@ -140,10 +140,10 @@ def _extend(over: Overhang, i: int, j: int, stack: I4) -> None:
             if inside or (0 <= plane_id[y, x] < number and _height_beside(over, y, x) > 0):
                 over.visited[y, x] = number
                 outside += not inside
-                stack[tail] = y * columns + x
+                cells[tail] = y * columns + x
                 tail += 1
     if outside <= OVERHANG.outside_ratio * (tail - outside):
-        for p in stack[: tail if outside else 0]:
+        for p in cells[: tail if outside else 0]:
             y, x = row_and_column(p, columns)
             if plane_id[y, x] != number:
                 over.heights.height[y, x], plane_id[y, x] = _height_beside(over, y, x), number

@@ -101,7 +101,7 @@ def _measure(
             continue
         x, y = (j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy
         facing = max(-(x * normal[0] + y * normal[1] + normal[2]), 0.1)
-        area = samples.share / (v * v * intrinsics.fx * intrinsics.fy * facing)
+        area = samples.cells_per_sample / (v * v * intrinsics.fx * intrinsics.fy * facing)
         total += area
         for d in range(2):
             axis = up if d else side
@@ -123,17 +123,17 @@ def _clear(
     """
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
-    stack, state = unset(inv_depth.size, np.int32), unset(inv_depth.shape, np.uint8)
+    cells, state = unset(inv_depth.size, np.int32), unset(inv_depth.shape, np.uint8)
     _mark(grid, plane_id, plane, state)
     total = 0.0
     for i in range(rows):
         for j in range(columns):
             if state[i, j] == UNMEASURED:
-                count, area = _flood(grid, axes[0], i, j, state, stack)
+                count, area = _flood(grid, axes[0], i, j, state, cells)
                 large = area >= WALLS.part_m2
-                if large and not _is_free_standing(grid, axes, max_size_m, state, stack[:count]):
+                if large and not _is_free_standing(grid, axes, max_size_m, state, cells[:count]):
                     total += area
-                    for p in stack[:count]:
+                    for p in cells[:count]:
                         state[p // columns, p % columns] = CLEARED
     for i in range(rows if total >= WALLS.cleared_m2 else 0):
         states, marks, plane_ids = state[i], walls[i], plane_id[i]
@@ -176,18 +176,18 @@ def _is_free_standing(grid: DepthGrid, axes: F8, max_size_m: float, state: U1, c
 
 
 @kernel(inline=True)
-def _flood(grid: DepthGrid, normal: F8, i: int, j: int, state: U1, stack: I4) -> tuple[int, float]:
-    """Mark the connected part of a wall at cell (i, j) as `ON_WALL`; list its cells in ``stack``.
+def _flood(grid: DepthGrid, normal: F8, i: int, j: int, state: U1, cells: I4) -> tuple[int, float]:
+    """Mark the connected part of a wall at cell (i, j) as `ON_WALL`; list its cells in ``cells``.
 
     Returns the number of cells and their area, m². ``normal`` (3,) is that of the wall, sensor
     frame; ``state`` (rows, columns) holds the marks, `UNMEASURED` in cells to visit.
     """
     inv_depth, k = grid.inverse_depth, grid.intrinsics
     rows, columns = inv_depth.shape
-    stack[0], state[i, j] = i * columns + j, ON_WALL
+    cells[0], state[i, j] = i * columns + j, ON_WALL
     head, tail, area = 0, 1, 0.0
     while head < tail:
-        i, j = stack[head] // columns, stack[head] % columns
+        i, j = cells[head] // columns, cells[head] % columns
         head += 1
         x, y, w = (j - k.cx) / k.fx, (i - k.cy) / k.fy, inv_depth[i, j]
         facing = max(-(x * normal[0] + y * normal[1] + normal[2]), 0.1)
@@ -196,7 +196,7 @@ def _flood(grid: DepthGrid, normal: F8, i: int, j: int, state: U1, stack: I4) ->
             v, u = i + di, j + dj
             if v < 0 or u < 0 or v >= rows or u >= columns or state[v, u] != UNMEASURED:
                 continue
-            stack[tail], state[v, u] = v * columns + u, ON_WALL
+            cells[tail], state[v, u] = v * columns + u, ON_WALL
             tail += 1
     return tail, area
 

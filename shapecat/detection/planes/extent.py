@@ -101,7 +101,7 @@ def area_of(inliers: DepthSamples, plane: F8, distance: float) -> float:
         level = plane[0] * inliers.j[k] + plane[1] * inliers.i[k] + plane[2]
         facing = level * distance  # the cosine between the normal and the ray
         total += 1 / (level * level * (facing if facing > 0.05 else 0.05))
-    return float(inliers.share * total)
+    return float(inliers.cells_per_sample * total)
 
 
 @kernel(inline=True)

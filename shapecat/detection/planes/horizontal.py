@@ -120,7 +120,7 @@ def fit_peaks(
         offset = float(np.partition(at_peak, size // 2)[size // 2])
         if offset > -PLANES.margin_m:
             continue
-        peak = DepthSamples(j, i, inv_depth, samples.share)
+        peak = DepthSamples(j, i, inv_depth, samples.cells_per_sample)
         plane, is_large = _fit(peak, intrinsics, up, trials, offset)
         if is_large:
             a, b, c = plane.astype(np.float32)

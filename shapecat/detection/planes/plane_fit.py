@@ -19,13 +19,13 @@ class DepthSamples(NamedTuple):
     ----------
     j, i : (n,) float32 columns and rows.
     inverse_depth : (n,) float32, 1/m.
-    share : the number of cells that each sample represents.
+    cells_per_sample : the number of cells that each sample represents.
     """
 
     j: F4
     i: F4
     inverse_depth: F4
-    share: int
+    cells_per_sample: int
 
 
 @kernel
@@ -42,7 +42,7 @@ def select_inliers(samples: DepthSamples, plane: F8, tolerance: float) -> DepthS
         level = plane[0] * j + plane[1] * i + plane[2]
         inliers[0, n], inliers[1, n], inliers[2, n] = j, i, v
         n += (level > 0) & (abs(v - level) < tolerance)
-    return DepthSamples(inliers[0][:n], inliers[1][:n], inliers[2][:n], samples.share)
+    return DepthSamples(inliers[0][:n], inliers[1][:n], inliers[2][:n], samples.cells_per_sample)
 
 
 @kernel(inner=True)

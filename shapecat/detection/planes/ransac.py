@@ -60,7 +60,7 @@ def select_outliers(samples: DepthSamples, plane: F8, tolerance: float) -> Depth
         j, i, v = samples.j[k], samples.i[k], samples.inverse_depth[k]
         outliers[0, n], outliers[1, n], outliers[2, n] = j, i, v
         n += abs(v - (a * j + b * i + c)) > gate
-    return DepthSamples(outliers[0][:n], outliers[1][:n], outliers[2][:n], samples.share)
+    return DepthSamples(outliers[0][:n], outliers[1][:n], outliers[2][:n], samples.cells_per_sample)
 
 
 def draw_trials(rng: np.random.Generator) -> F8:

@@ -157,8 +157,8 @@ def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane
     level = gravity_rotation(plane.up) @ (np.stack([x, y, np.ones(j.size)]) / inv_depth)
     over = (COS[:, None] * level[0] + SIN[:, None] * level[1] < plane.extent[:, None]).all(axis=0)
     facing = np.maximum(-level[2] * inv_depth, STRIPS.min_rise)
-    share = AREA_STRIDE * COLUMN_STRIDE / (intrinsics.fx * intrinsics.fy)
-    return float((share / (facing * inv_depth**2))[over].sum())
+    area = AREA_STRIDE * COLUMN_STRIDE / (intrinsics.fx * intrinsics.fy)
+    return float((area / (facing * inv_depth**2))[over].sum())
 
 
 def _peaks(amount: F8, threshold: float) -> Iterator[tuple[float, float]]:

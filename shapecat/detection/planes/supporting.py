@@ -94,8 +94,8 @@ def _is_top(
 ) -> bool:
     """Return whether a plane is the top of an object or of several, by rules 6 to 9.
 
-    ``drop`` is the height above the next plane below, metres, infinite if there is none;
-    ``area_m2`` counts the covered area too.
+    ``inliers`` are the samples of the plane, ``drop`` is its height above the next plane below,
+    metres, and ``area_m2`` counts the covered area too.
     """
     furniture = area_m2 >= PLANES.furniture_m2
     on_wall, beyond = _count_below_edge(grid, inliers, plane, drop)
@@ -161,7 +161,7 @@ def _count_above(grid: DepthGrid, plane: SupportingPlane) -> tuple[int, int]:
 
 @kernel
 def _largest_part(grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane) -> float:
-    """Return the area of the largest connected part of a plane, m2.
+    """Return the area of the largest connected part of a plane, m², from its ``inliers``.
 
     Objects on a plane hide parts of it, so nearer surface and missing depth connect parts. Farther
     surface, which is seen past an edge, separates them.
@@ -182,7 +182,7 @@ def _largest_part(grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane
         i, j = int(inliers.i[k]), int(inliers.j[k])
         level = plane.a * j + plane.b * i + plane.c
         facing = max(-level * plane.offset, 0.05)
-        areas[part[i, j]] += inliers.share / (level * level * facing)
+        areas[part[i, j]] += inliers.cells_per_sample / (level * level * facing)
     return float(areas.max() / (grid.intrinsics.fx * grid.intrinsics.fy))
 
 
@@ -211,9 +211,10 @@ def _is_enclosed(grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane)
 def _count_below_edge(
     grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane, drop: float
 ) -> tuple[int, int]:
-    """Count the samples below the edge of a plane that are on a wall, and those farther away.
+    """Count the points straight below the front edge of a plane: on a wall, and in free space.
 
-    ``drop`` is the height above the next plane below, metres.
+    The points begin at the edge in front of each of the ``inliers``, which are the samples of the
+    plane, and end at ``drop``, its height above the next plane below, metres.
     """
     on_wall = beyond = 0
     for k in range(inliers.inverse_depth.size):

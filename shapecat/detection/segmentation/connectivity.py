@@ -158,8 +158,8 @@ def _link_run(
 
     Parameters
     ----------
-    plane_id, inv_depth, planes, links : the arrays of `_link`, flattened. jump : step in inverse
-        depth that separates two surfaces, 1/m.
+    plane_id, inv_depth, planes, links : the arrays of `_link`, flattened.
+    jump : step in inverse depth that separates two surfaces, 1/m.
     run : the index of its first cell, the index of that cell's local plane, and the number of
         cells.
     steps : index offsets from a cell to its neighbour, from its local plane to the neighbour's, and

@@ -195,8 +195,8 @@ def _four(
 ) -> tuple[float, float, float, float, float]:
     """Return the sums of 1, x, x x, v, x v over the samples at columns -3, -1, 1, 3 from ``p``.
 
-    Here v is the difference from ``center``. ``values`` are from `_copy_windows`; the gates of the
-    outer and the inner samples are as in `_sample`.
+    Here x is the column, v the difference from ``center``. ``values`` are from `_copy_windows`; the
+    gates of the outer and the inner samples are as in `_sample`.
     """
     a, va = _sample(values, p - 3, center, outer_gate)
     b, vb = _sample(values, p - 1, center, inner_gate)

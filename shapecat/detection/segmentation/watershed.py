@@ -69,10 +69,10 @@ def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n
 
 @kernel(inline=True)
 def _min_size(sizes: I4, n: int) -> tuple[int, int]:
-    """Choose the largest components of ``sizes`` (k,), as many as ``n`` segments leave room for.
+    """Choose the largest components, as many as there is room for beside ``n`` segments.
 
-    Returns a size and a number: all larger components are chosen, and this number of those of
-    exactly that size.
+    ``sizes`` (k,) are those of the components, from 1. Returns a size and a number: all larger
+    components are chosen, and this number of those of exactly that size.
     """
     min_size, room = SEGMENTATION.min_cells - 1, SEGMENTATION.max_segments - n
     while True:

@@ -124,7 +124,7 @@ def _find_cuts(outlines: Outlines, p: int, cuts: Bool) -> bool:
     cuts[:] = False
     for band in range(first + BANDS_BESIDE, last - BANDS_BESIDE + 2):
         steps[band] = _step_at(outlines, p, band)
-    below = 0  # cells since the last cut; ``above``: from here on
+    below = 0  # cells since the last cut; ``above``: cells in this band and higher ones
     for band in range(BANDS - BANDS_BESIDE):
         largest = steps[band] >= SEGMENTATION.both_steps_m and band >= BANDS_BESIDE
         for k in range(
