@@ -90,7 +90,7 @@ def _detections(numbers: Any, places: Any, beliefs: Any, rng: Any) -> dict[str, 
 
 
 def _shown(numbers: Any, rng: Any) -> tuple[Any, Any]:
-    """Return the frame and the object of each detection; numbers from `OBJECTS` up are false."""
+    """Return the frame and the object of each detection; an object >= `OBJECTS` is false."""
     shown = rng.random((len(numbers), OBJECTS + PLACES_OF_FALSE)) > OVERLOOKED
     turn = (numbers[:, None] + np.arange(OBJECTS) * VISIT_FRAMES // OBJECTS) % VISIT_FRAMES
     shown[:, :OBJECTS] &= turn >= AWAY_FRAMES

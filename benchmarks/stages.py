@@ -68,7 +68,10 @@ def _categorize(points: F4, eye: F8, settings: Settings, model: Categorizer) -> 
 
 
 def _speedup(objects: list[tuple[F4, F8]], settings: Settings, model: Categorizer) -> float:
-    """Return the speed-up of two threads over one for all objects, from the best wall times."""
+    """Return the speed-up of two threads over one for all objects, from the best wall times.
+
+    ``objects`` are the points (n, 3) and the eye (3,) of each.
+    """
     seconds = {}
     for threads in (1, 2):
         with ThreadPoolExecutor(threads) as pool:

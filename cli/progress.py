@@ -108,7 +108,8 @@ class Progress:
     def _compiling(self, phase: str, done: int) -> None:
         """Note once that kernels are being compiled, and then how many, at intervals.
 
-        All workers report; most of them wait for one that compiles.
+        ``phase`` is `COMPILE` or `WAIT_FOR_KERNELS`, ``done`` the number of kernels. All workers
+        report; most of them wait for one that compiles.
         """
         counts = phase == COMPILE and done > 0
         now = time.monotonic()
@@ -199,8 +200,8 @@ def _share(phase: str, done: int, total: int | None) -> float:
 
 
 def _words(name: str, phase: str, done: int, total: int | None) -> str:
-    share = f" {done}/{total}" if total else f" {done}"
-    return f"{name}: {PHASES.get(phase, phase)}{share}"
+    count = f" {done}/{total}" if total else f" {done}"
+    return f"{name}: {PHASES.get(phase, phase)}{count}"
 
 
 def _duration(seconds: float) -> str:

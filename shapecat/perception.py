@@ -232,7 +232,10 @@ def _copy_for(frame: Frame, first: Perception) -> Perception:
 
 
 def _restrict_to(frame: Frame, perceived: Frame, perception: Perception) -> Perception:
-    """Remove pixels that show something else in the frame itself from the candidates."""
+    """Remove from the candidates the pixels that show something else in the frame itself.
+
+    ``perceived`` is the frame after fusion with earlier ones.
+    """
     if perceived is frame:
         return perception
     scene = keep_same_surface(perception.scene, frame, perceived)

@@ -74,9 +74,9 @@ def _simplified(ring: F8) -> F8:
 
 @kernel
 def _keep_far(line: F8, first: int, last: int, keep: Bool) -> None:
-    """Mark in ``keep`` the corners from ``first`` to ``last`` that the simplified line keeps.
+    """Mark in ``keep`` the corners between ``first`` and ``last`` that the simplified line keeps.
 
-    ``line`` (n, 2) are the corners, pixels; ``keep`` is (n,).
+    ``line`` (n, 2) are the corners, pixels; ``keep`` is (n,). Both ends must be marked already.
     """
     stack = [(first, last)]
     while len(stack) > 0:

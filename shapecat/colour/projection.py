@@ -75,10 +75,9 @@ def kernel_lens(lens: LensCamera) -> Lens:
 
 
 def rectified(pixels: U1, lens: LensCamera) -> U1:
-    """Return a colour image (h, w, 3) uint8 without the distortion of its lens.
+    """Return a colour image, ``pixels`` (h, w, 3) uint8, without the distortion of its lens.
 
-    ``pixels`` is the image (h, w, 3). Colours are interpolated bilinearly. Pixels outside the
-    original image are black.
+    Colours are interpolated bilinearly. Pixels outside the original image are black.
     """
     if not lens.model:
         return pixels

@@ -114,7 +114,7 @@ def _claim(match: _Match, number: int, owners: I4) -> Mask:
 
 
 def _cut_out(inside: Bool, left: int, top: int) -> Mask:
-    """Return a mask (h, w) whose first pixel is (``left``, ``top``), without empty margins."""
+    """Return ``inside`` (h, w) without empty margins; its first pixel is (``left``, ``top``)."""
     rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
     if not rows.size:
         return EMPTY_MASK

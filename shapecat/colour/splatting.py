@@ -233,8 +233,9 @@ def _paint(
 ) -> None:
     """Paint the labels of squares into a window, where they are the nearest.
 
-    ``inverse_depth`` (n,) is that of the squares, ``nearest`` (h, w) that of the painted labels.
-    ``corner`` is the left and top of the window; the labels go to ``splat`` (h, w).
+    ``squares`` (n, 4) are from `_cover`, with their ``labels`` and ``inverse_depth`` (n,).
+    ``corner`` is the left and top of the window; the labels go to ``splat`` (h, w), and their
+    inverse depths to ``nearest`` (h, w).
     """
     left, top = corner
     for i in range(labels.size):

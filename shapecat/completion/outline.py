@@ -74,9 +74,10 @@ def support_function(
 
 @kernel(inline=True)
 def _overshoot(x: F4, y: F4, a: float, b: float, top: float, noise: float, flat: float) -> float:
-    """Return how far ``top`` is beyond the mean of its side; reduced if the side is not flat.
+    """Return how far ``top`` is beyond the mean of its side, metres; less if the side is not flat.
 
-    The side is in the direction (``a``, ``b``); the other parameters are as in `support_function`.
+    ``top`` is the support function in the direction (``a``, ``b``); the side consists of the points
+    less than ``noise`` below it. The other parameters are as in `support_function`.
     """
     count, total = 0, 0.0
     for i in range(x.size):

@@ -189,7 +189,11 @@ def _visible_outline(points: F4, facing: Bool, category: str) -> F8:
 
 
 def _bounds(heights: F4) -> tuple[float, float, float]:
-    """Return bottom, lowest visible height and top, from heights (n,) above the support, metres."""
+    """Return bottom, lowest visible height and top of an object, metres, without outliers.
+
+    ``heights`` (n,) are those of its points above the support. The bottom is at 0, or below it if
+    the whole object is.
+    """
     ascending, stray = np.sort(heights), int((1 - _TOP) * len(heights))
     lowest, top = float(ascending[stray]), float(ascending[-1 - stray])
     near_top = ascending[np.searchsorted(ascending, top - _NOISY_M) :]

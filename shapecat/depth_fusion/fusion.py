@@ -141,7 +141,11 @@ def _expected_depth(depth: F4, range_m: float) -> F4:
 
 @kernel
 def _agreeing_share(expected: F4, earlier: F4, homography: F4, shift: F4) -> float:
-    """Return the fraction of pixels with depth in both images whose depths agree."""
+    """Return the fraction of pixels with depth in both images whose depths agree.
+
+    ``expected`` (h, w) is from `_expected_depth`, ``homography`` and ``shift`` from `_homography`;
+    ``earlier`` (h, w) are the depths of the earlier image, metres.
+    """
     columns = expected.shape[1]
     places = np.zeros((3, columns), np.float32)
     x, y, z = places[0], places[1], places[2]
@@ -175,9 +179,10 @@ def _add_unmoved(expected: F4, earlier: F4, total: F4, count: F4) -> None:
 
 @kernel
 def _add_moved(expected: F4, earlier: F4, homography: F4, shift: F4, total: F4, count: F4) -> None:
-    """Add the earlier depths that agree to ``total``, and their number to ``count``.
+    """Add the earlier depths that agree to ``total`` (h, w), and their number to ``count`` (h, w).
 
-    A hole that gets a depth also gets it in ``expected``.
+    A hole that gets a depth also gets it in ``expected``. The other parameters are as in
+    `_agreeing_share`.
     """
     agree, jump = np.float32(AGREE), np.float32(DISCONTINUITY)
     coordinates = np.zeros((3, expected.shape[1]), np.float32)
@@ -202,7 +207,10 @@ def _add_moved(expected: F4, earlier: F4, homography: F4, shift: F4, total: F4, 
 
 @kernel(inner=True)
 def _project_row(depths: F4, v: int, homography: F4, shift: F4, x: F4, y: F4, z: F4) -> None:
-    """Write column x, row y and depth z, in the earlier image, of the pixels in row ``v``."""
+    """Write column x, row y and depth z (w,), in the earlier image, of the pixels in row ``v``.
+
+    ``depths`` (w,) are those of the row; ``homography`` and ``shift`` are from `_homography`.
+    """
     min_depth = np.float32(NEAREST_M)
     row = np.float32(v)
     a, b = homography[0, 1] * row + homography[0, 2], homography[1, 1] * row + homography[1, 2]
@@ -217,7 +225,7 @@ def _project_row(depths: F4, v: int, homography: F4, shift: F4, x: F4, y: F4, z:
 
 @kernel(inner=True)
 def _interpolate(earlier: F4, x: float, y: float) -> Any:
-    """Interpolate between the four depths around (x, y); 0 outside the image.
+    """Interpolate between the four depths around column x and row y of an image; 0 outside it.
 
     It is also 0 if more than half of the weight belongs to missing depths.
     """

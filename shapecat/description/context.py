@@ -307,9 +307,11 @@ def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
 
 @kernel(inline=True)
 def _around(euclidean: F4, geodesic: F4, out: F4) -> None:
-    """Compare distances along the surface with Euclidean distances; write to ``out`` (3,).
+    """Write ratios of the distances between neurons to ``out`` (3,).
 
-    Both are (k, k), between the neurons, as in `Surface`.
+    They are mean geodesic to mean Euclidean distance, at most 4; largest to mean geodesic distance;
+    and, by `_ratio`, the smallest to the largest sum of a neuron's geodesic distances.
+    ``euclidean`` and ``geodesic`` (k, k) are as in `Surface`.
     """
     count = geodesic.shape[0]
     total = direct = longest = max_sum = 0.0

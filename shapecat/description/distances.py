@@ -104,7 +104,8 @@ def _shorten(paths: F4, i: int, via: F4, k: int) -> None:
 def _joined(paths: F4, euclidean: F4) -> F4:
     """Return the paths (n, n) without padding, and fill in those that do not exist.
 
-    ``euclidean`` (n, n) are the distances of the nodes.
+    Their length is that of the longest path plus the distance of the two nodes. ``euclidean`` (n,
+    n) are the distances of the nodes.
     """
     count = euclidean.shape[0]
     result = np.zeros((count, count), np.float32)

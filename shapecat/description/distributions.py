@@ -36,7 +36,7 @@ _BAND_GEODESIC, _BAND_EUCLIDEAN, _BAND_CURVED = (
 def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
     """Add ``weight`` to a histogram at ``place`` (0 to 1), split between the two nearest bins.
 
-    The histogram is ``bins`` elements of ``row`` from ``start`` on.
+    The histogram is ``bins`` elements of ``row``, beginning at ``start``.
     """
     at = min(max(place * bins - 0.5, 0.0), bins - 1.0)
     k = min(int(at), bins - 2)
@@ -117,8 +117,8 @@ def distributions(surface: Surface, normals: F4, curvatures: F4, out: F4) -> Non
 def _curvature_row(row: F4, first: float, second: float) -> None:
     """Write the histograms of one neuron with the principal curvatures ``first`` and ``second``.
 
-    They are shape index, curvedness and mean curvature, after a 1, in the first elements of
-    ``row``.
+    The first elements of ``row`` become a 1 and the histograms of shape index, curvedness and mean
+    curvature.
     """
     row[0] = 1
     spread = first - second
@@ -145,10 +145,11 @@ def _partition(
 ) -> None:
     """Write the mean of ``rows`` over the neurons in each of ``parts`` equal intervals.
 
-    The intervals divide the range of ``order`` (n,); ``weight`` (n,) is each neuron's fraction of
-    the points. The blocks of geodesic distances, Euclidean distances and curvature begin at the
-    three last indices in the descriptor ``out``. A neuron counts in the two intervals whose middles
-    are nearest, so that a small change of the graph changes the descriptor little.
+    ``rows`` (n, k) are a 1 and the histograms of each neuron. The intervals divide the range of
+    ``order`` (n,); ``weight`` (n,) is each neuron's fraction of the points. The blocks of geodesic
+    distances, Euclidean distances and curvature begin at the three last indices in the descriptor
+    ``out``. A neuron counts in the two intervals whose middles are nearest, so that a small change
+    of the graph changes the descriptor little.
     """
     low, high = outer_range(order)
     sums = np.zeros((parts, rows.shape[1]))

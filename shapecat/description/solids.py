@@ -126,7 +126,7 @@ def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, o
     flat = np.sqrt((long_u * long_u + long_v * long_v) / 2)
     size = np.sqrt((long_u * long_u + long_v * long_v + tall * tall) / 3)
     corners = np.zeros((3, count), np.float32)
-    share, off = np.zeros(3), np.zeros(3)
+    on_face, off = np.zeros(3), np.zeros(3)
     sides = total = 0.0
     for i in range(count):
         du, dv, dz = abs(high_u - u[i]), abs(high_v - v[i]), abs(high - z[i])
@@ -134,7 +134,7 @@ def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, o
         total += 1.0 - up * up
         sides += (1.0 - up * up) * min(du, dv)
         face = 2 if dz <= du and dz <= dv else (0 if du <= dv else 1)
-        share[face] += 1
+        on_face[face] += 1
         off[face] += min(du, dv, dz)
         # 0 on the edge where two faces meet, 1 on the opposite edges
         corners[0, i] = max(du / long_u, dv / long_v)
@@ -147,11 +147,11 @@ def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, o
     out[4] = inner_range(corners[0])[0]
     first, second = inner_range(corners[1])[0], inner_range(corners[2])[0]
     out[5], out[6] = min(first, second), max(first, second)
-    a = 0 if share[0] >= share[1] else 1
+    a = 0 if on_face[0] >= on_face[1] else 1
     for k in range(3):
         face = 2 if k == 2 else (a if k == 0 else 1 - a)
-        out[7 + k] = share[face] / count
-        out[10 + k] = off[face] / max(share[face], 1.0) / size
+        out[7 + k] = on_face[face] / count
+        out[10 + k] = off[face] / max(on_face[face], 1.0) / size
 
 
 @kernel(inline=True)

@@ -112,7 +112,10 @@ def _predict_all(
     splits: list[tuple[DescribedViews, DescribedViews]],
     categories: tuple[str, ...],
 ) -> tuple[I4, F8]:
-    """Return the true columns (n,) and the posteriors (n, c) of all test views."""
+    """Return the indices of the true categories (n,) and the posteriors (n, c) of all test views.
+
+    ``splits`` are training and test views, from `_folds`.
+    """
     truths, posteriors = [], []
     for train, test in splits:
         known = test.where(test.labels != UNKNOWN)
@@ -124,7 +127,7 @@ def _predict_all(
 def _compared(name: str, learned: int, truth: I4, posteriors: F8) -> Compared:
     """Return the figures of a classifier that was trained on ``learned`` views.
 
-    ``truth`` (n,) are the true columns, ``posteriors`` are (n, c).
+    ``truth`` and ``posteriors`` are from `_predict_all`.
     """
     predicted = posteriors.argmax(axis=1)
     table = metrics.confusion(truth, predicted, posteriors.shape[1])

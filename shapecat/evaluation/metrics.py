@@ -73,7 +73,7 @@ def balanced_accuracy(table: I4) -> float:
 def calibration_curve(truth: I4, posteriors: F4) -> tuple[Bin, ...]:
     """Return the calibration curve: bins of equal width in confidence, without the empty ones.
 
-    ``truth`` (n,) are the true columns of ``posteriors`` (n, c).
+    ``truth`` (n,) are the columns of the true categories in ``posteriors`` (n, c).
     """
     confidence = np.asarray(posteriors, np.float64).max(axis=1, initial=0.0)
     right = np.asarray(posteriors).argmax(axis=1) == truth if len(truth) else np.zeros(0, bool)
@@ -88,7 +88,7 @@ def calibration_curve(truth: I4, posteriors: F4) -> tuple[Bin, ...]:
 def expected_calibration_error(truth: I4, posteriors: F4) -> float:
     """Return the mean absolute difference between confidence and accuracy over bins of confidence.
 
-    ``truth`` (n,) are the true columns of ``posteriors`` (n, c). The result is NaN without views.
+    ``truth`` and ``posteriors`` are as for `calibration_curve`. The result is NaN without views.
 
     Source: Naeini et al. 2015; Guo et al. 2017, eq. 3.
     """

@@ -270,7 +270,7 @@ def _confusion(report: Report) -> Rows:
 
 
 def breakdown_table(name: str, ranges: Ranges) -> tuple[Row, Rows]:
-    """Return header and rows of the table of a breakdown; ``name`` says by what."""
+    """Return header and rows of the table of a breakdown by the quantity ``name``."""
     rows: Rows = [(label, str(count), figure_text(value)) for label, count, value in ranges]
     return (name, "views", "accuracy"), rows
 

@@ -34,8 +34,8 @@ class DescribedViews(NamedTuple):
     elevations : (n,) elevation of the sensor as seen from the object, degrees; may be empty.
     functions : (n, f) shape distributions from `shapecat.evaluation.shape_functions`; may
         be empty.
-    off_support : categories whose lowest point, in most views (also skipped ones), is farther than
-        `_NEAR_SUPPORT_M` from z = 0. Their points are probably in another frame.
+    off_support : categories of which most views, even skipped ones, have their lowest point farther
+        than `_NEAR_SUPPORT_M` from z = 0. Their points are probably in another frame.
     """
 
     descriptors: F4

@@ -172,7 +172,10 @@ def _grow(
 
 @kernel(inner=True)
 def _collect(binned: U1, columns: I4, rows: I4, gradient: F4, hessian: F4, sums: F4) -> None:
-    """Add the gradient and hessian of the views in ``rows`` to ``sums`` (columns, BINS, 2)."""
+    """Add the gradient and hessian of the views in ``rows`` to ``sums`` (columns, BINS, 2).
+
+    The parameters are as for `_grow`.
+    """
     g, h = gradient[rows], hessian[rows]
     for c in range(columns.size):
         bins, out = binned[columns[c]], sums[c]
@@ -184,7 +187,11 @@ def _collect(binned: U1, columns: I4, rows: I4, gradient: F4, hessian: F4, sums:
 
 @kernel(inner=True)
 def _best_cut(sums: F4, l2: float, min_hessian: float, best: F8) -> float:
-    """Write gain, column and bin of a leaf's best split into ``best``; return its Newton step."""
+    """Write gain, column and bin of a leaf's best split into ``best`` (3,).
+
+    Returns the Newton step of the leaf. ``sums`` are from `_collect`; the other parameters are as
+    in `TreeSettings`.
+    """
     gradient = hessian = 0.0
     for k in range(BINS):
         gradient += sums[0, k, 0]
@@ -215,7 +222,8 @@ def _best_cut(sums: F4, l2: float, min_hessian: float, best: F8) -> float:
 def _divide(bins: U1, rows: I4, first: int, last: int, cut: int, spare: I4) -> int:
     """Move the views with bins <= ``cut`` to the front of rows[first:last], keeping their order.
 
-    Return the index of the first view after them; ``spare`` is scratch memory.
+    ``bins`` (n,) are the bins of all views in one feature. Returns the index in ``rows`` (n,) of
+    the first other view; ``spare`` (n,) is work space.
     """
     low, high = first, 0
     for i in range(first, last):

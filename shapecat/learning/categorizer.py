@@ -191,7 +191,11 @@ def _predict(
     posteriors: F4,
     novelty: F4,
 ) -> None:
-    """Write posteriors (n, c) and novelty (n,) of standardised descriptors (n, f)."""
+    """Write posteriors (n, c) and novelty (n,) of standardised descriptors ``features`` (n, f).
+
+    ``forest`` is `FlatForest.parameters`; ``use_linear`` is False if ``linear`` is all 0. The other
+    parameters are as in `Categorizer`.
+    """
     trees, leaf_id = forest
     categories = posteriors.shape[1]
     reached = np.zeros(trees.roots.size, np.int64)

@@ -116,7 +116,11 @@ def add_categories(
 
 
 def _order(old: int, new: int, *, unknown: bool) -> I4:
-    """Return the column that each final logit has during the fit."""
+    """Return, for each logit of the extended model (n,), its column during the fit.
+
+    The model has ``old`` and ``new`` categories, and then, if ``unknown``, the logit for unknown
+    shapes. During the fit, the new categories come last.
+    """
     first = old + unknown
     return np.concatenate([np.arange(old), np.arange(first, first + new), np.arange(old, first)])
 
@@ -156,8 +160,9 @@ def _logits(inputs: _Inputs, weights: F8) -> F8:
 def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, l2: float, steps: int) -> F8:
     """Return the weights (`_width`, new categories) of the new logits.
 
-    ``old`` (n, k) are the old logits, divided by the temperature. ``truth`` (n,) is the true column
-    of each view, where new columns follow the old ones. ``start`` are initial weights.
+    ``old`` (n, k) are the old logits, divided by the temperature. ``truth`` (n,) is the column of
+    each view's true category, where new columns follow the old ones. ``start`` are initial weights,
+    ``l2`` is the factor of the L2 penalty, and ``steps`` limits the iterations.
     """
     views, first = old.shape
     count = start.shape[1]

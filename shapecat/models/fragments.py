@@ -69,13 +69,16 @@ def _direction(rng: np.random.Generator) -> F8:
 
 
 def _beside_edge(across: F8, rng: np.random.Generator) -> Bool:
-    """Return the points (n,) on one side of a straight edge; ``across`` (n, 2) are their places."""
+    """Return which points (n,) are on one side of a straight edge.
+
+    ``across`` (n, 2) are the points, from `image_plane_points`.
+    """
     along = across @ _direction(rng)
     return np.asarray(along <= np.quantile(along, rng.uniform(0.35, 0.8)))
 
 
 def _around_bar(across: F8, rng: np.random.Generator) -> Bool:
-    """Return the points (n,) on both sides of a bar; ``across`` (n, 2) are their places."""
+    """Return which points (n,) are not behind a bar; ``across`` is as in `_beside_edge`."""
     along = across @ _direction(rng)
     width = rng.uniform(0.15, 0.4)
     start = rng.uniform(0.15, 0.85 - width)
@@ -84,7 +87,7 @@ def _around_bar(across: F8, rng: np.random.Generator) -> Bool:
 
 
 def _outside_corner(across: F8, rng: np.random.Generator) -> Bool:
-    """Return the points (n,) outside a corner; ``across`` (n, 2) are their places in the image."""
+    """Return which points (n,) are outside a corner; ``across`` is as in `_beside_edge`."""
     first = _direction(rng)
     second = np.array([-first[1], first[0]])
     a, b = across @ first, across @ second

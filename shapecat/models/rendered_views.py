@@ -117,10 +117,10 @@ def _visible_fractions(
 ) -> F8:
     """Return the visible fraction of each object, (count,).
 
-    ``mesh_ids`` (h, w) are those of the depth image, -1 where it has no depth. The fraction is the
-    object's number of depth pixels, divided by its number of pixels in an image twice as wide and
-    high in which nothing occludes it. It is 0 for an object with fewer than `_FEWEST_PIXELS` depth
-    pixels.
+    ``mesh_ids`` (h, w) are those of the depth image of ``camera`` at ``pose``, -1 where it has no
+    depth. The fraction is the object's number of depth pixels, divided by its number of pixels in
+    an image twice as wide and high in which nothing occludes it. It is 0 for an object with fewer
+    than `_FEWEST_PIXELS` depth pixels.
     """
     seen_pixels = np.bincount(mesh_ids[mesh_ids >= 0], minlength=count + 1)
     width, height = camera.width // _COARSE, camera.height // _COARSE

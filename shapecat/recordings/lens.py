@@ -76,6 +76,9 @@ def distortion_problem(model: str, coefficients: Sequence[float]) -> str:
 
 
 def _points_along(rays: F8, depth: F4) -> F4:
-    """Return the points (h, w, 3) at ``depth`` along the rays; NaN where depth is missing."""
+    """Return the points (h, w, 3), metres, on the ``rays`` of a `_Lens`; NaN without depth.
+
+    ``depth`` (h, w), metres, is measured along z.
+    """
     z = np.where(depth > 0, depth, np.float32(np.nan))
     return np.stack([rays[..., 0] * z, rays[..., 1] * z, z], axis=-1).astype(np.float32)

@@ -100,7 +100,10 @@ def still_fits(fit: PinholeFit, points: F4) -> bool:
 
 
 def _errors(camera: Camera, sample: tuple[F8, F8, F8, F8]) -> tuple[float, float]:
-    """Return the 95th percentile of the reprojection error and its RMS without outliers, pixels."""
+    """Return the 95th percentile of the reprojection error and its RMS without outliers, pixels.
+
+    ``sample`` is from `_sample`.
+    """
     u, v, x, y = sample
     error = np.hypot(camera.fx * x + camera.cx - u, camera.fy * y + camera.cy - v)
     keep = error <= max(3.0 * float(np.median(error)), 1e-3)

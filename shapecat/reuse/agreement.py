@@ -68,9 +68,9 @@ def _compare(
 
     Parameters
     ----------
-    pixels : (n,) flat indices of the points in ``depth``. depth, other : (h, w) metres, the image
-        with the points and the image to compare with. camera, other_camera : fx, fy, cx, cy,
-        pixels.
+    pixels : (n,) flat indices of the points in ``depth``.
+    depth, other : (h, w) metres, the image with the points and the image to compare with.
+    camera, other_camera : fx, fy, cx, cy, pixels.
     turn, shift : rotation (3, 3) and translation (3,), metres, of ``other_from_one``.
     """
     fx, fy, cx, cy = camera

@@ -190,7 +190,7 @@ def _moved_box(move: Move, box: FullBox | None) -> FullBox | None:
 
 
 def _similar(views: Records, keys: Records) -> Bool:
-    """Return which pairs of summaries are alike; both arrays are broadcast to its shape."""
+    """Return which pairs of summaries, records of `_SUMMARY`, are alike; the arrays broadcast."""
     ray, key_ray = views["ray_m"], keys["ray_m"]
     distance, key_distance = np.linalg.norm(ray, axis=-1), np.linalg.norm(key_ray, axis=-1)
     area = views["pixels"] * distance**2 / (keys["pixels"] * key_distance**2)

@@ -23,8 +23,8 @@ __all__ = ["FinishedRun", "find_runs", "find_usable", "open_source", "read_finis
 class FinishedRun:
     """A run folder, with the content of run.json and the final label of each track.
 
-    ``common`` holds the categories of all runs that are exported together, so that these have the
-    same order in each run; it is empty for a single run.
+    ``common`` holds the categories of all runs that are exported together, so that categories have
+    the same order in each run; it is empty for a single run.
     """
 
     folder: Path

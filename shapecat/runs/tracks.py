@@ -216,7 +216,7 @@ def _columns(
 ) -> dict[str, Any]:
     """Return the table columns of some tracks, track after track.
 
-    ``boxes`` (n, 13) are their full boxes.
+    ``boxes`` (n, 13) are their full boxes, from `FullBoxes.of_tracks`.
     """
 
     def column(name: str, kind: str, *width: int) -> Any:

@@ -266,7 +266,7 @@ def grow_thesis(
 def _prune(gas: Gas, count: int, before: I4) -> int:
     """Remove neurons whose ``wins`` are still as in ``before``, but keep 3; return their number.
 
-    ``before`` (count,) is changed like the neurons.
+    The others move to the front, and so do their elements of ``before`` (count,).
     """
     i = 0
     while i < count:

@@ -51,7 +51,7 @@ class _Vectors:
         return self.build.load(place, align=4)
 
     def store(self, value: _Value, address: _Value, index: _Value) -> None:
-        """Store a vector from an index of an array on."""
+        """Store a vector in an array, beginning at an index."""
         place = self.build.bitcast(self.build.gep(address, [index]), value.type.as_pointer())
         self.build.store(value, place, align=4)
 

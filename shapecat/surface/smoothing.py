@@ -107,7 +107,7 @@ def _smooth(points: F4, radius: float, cells: I4, size: I4, order: I4) -> F4:
     count = points.shape[0]
     keys = cells[order]
     moved = np.zeros((count, 3), np.float32)
-    offsets = np.zeros((count, 4))  # neighbours from the point on, in radii, and their weights
+    offsets = np.zeros((count, 4))  # of the neighbours from the point, in radii; and weights
     n = 0
     for i in range(count):
         k = _neighbours(points, i, radius, cells[i], size, keys, order, offsets)

@@ -23,7 +23,7 @@ def sorted_sides(sizes: F4) -> F8:
 
 
 def size_key(sizes: F4) -> F8:
-    """Return the logarithms (n, 3) of the `sorted_sides` of sizes (n, 3), metres."""
+    """Return the logarithms (n, 3) of the `sorted_sides`, plus 1 cm, of sizes (n, 3), metres."""
     return np.asarray(np.log(np.maximum(sorted_sides(sizes), 0.0) + _SIZE_SLACK_M))
 
 

@@ -34,7 +34,8 @@ class DetectionTable:
     """All detections of a stream, in the order of the frames.
 
     A detection takes only about 100 bytes, because the detections of many hours are in memory at
-    once.
+    once. A track is given by the indices of its detections, ascending; ``rows`` are indices of
+    frames, whose numbers are in ``frames``.
 
     Attributes
     ----------
@@ -109,7 +110,7 @@ class DetectionTable:
         return np.asarray(self.stamps_ns[self.rows[which]])
 
     def weights(self, track: I4) -> F8:
-        """Return the weight (k,) that each detection of a track (k,) has in the fusion.
+        """Return the weight (k,) that each detection of a ``track`` (k,) has in the fusion.
 
         Of detections with the same, copied description, only the first counts; others weigh 0.
         """
@@ -143,10 +144,10 @@ class DetectionTable:
         return np.asarray(self.centers[a] + share[:, None] * step)
 
     def frame_span(self, track: I4, max_gap_s: float) -> tuple[I4, Bool]:
-        """Return the frames (k,) from a track's first to its last detection, and a mask (k,).
+        """Return the rows (k,) from a track's first to its last detection, and a mask (k,).
 
         The mask marks the frames with a detection. Frames in gaps longer than ``max_gap_s`` are
-        left out, and so are frames of topics that never see the object.
+        left out, and so are frames of topics that never see the object. ``track`` is (d,).
         """
         frames = self.rows[track]
         gap_s = np.diff(self.stamps_ns[frames]) * 1e-9
@@ -158,11 +159,11 @@ class DetectionTable:
         return rows, np.isin(rows, frames)
 
     def sees(self, track: I4, rows: I4) -> Bool:
-        """Return the mask (n,) of frames ``rows`` (n,) whose topics have detections of a track."""
+        """Return the mask (n,) of ``rows`` (n,) whose topics have detections of ``track`` (d,)."""
         return np.isin(self.topics[rows], self.topics[self.rows[track]])
 
     def on_topics_of(self, track: I4, which: I4) -> I4:
-        """Return the detections among ``which`` whose topics also have detections of a track."""
+        """Return those detections in ``which`` whose topics have detections of ``track`` (d,)."""
         return which if len(self.names) == 1 else which[self.sees(track, self.rows[which])]
 
 

@@ -10,8 +10,9 @@ __all__ = ["Track"]
 class Track(Record):
     """One object over the frames of its streams, from its first to its last detection.
 
-    Between detections a track *coasts*: such a row has no detection, and its centre is interpolated
-    linearly in time. A gap longer than `TrackingSettings.max_missed_s` has no rows.
+    A track has a row for each frame. In a row without a detection the track *coasts*: its centre is
+    interpolated linearly in time between detections. A gap longer than
+    `TrackingSettings.max_missed_s` has no rows.
 
     Attributes
     ----------

@@ -15,9 +15,10 @@ class LabelledObject(Record):
 
     Attributes
     ----------
+    track : number of the track.
     category, confidence : final, from all views of the track.
     box, gas : box and surface of the visible part, sensor frame.
-    indices : (n,) ascending indices into the frame.
+    indices : (n,) ascending flat indices of its pixels or points in the frame.
     posterior : (c,) from this view alone.
     causal : (c,) fused from the track's views up to this frame.
     height_m : height of the visible box's centre above the surface the object stands on; NaN if

@@ -45,7 +45,7 @@ class Plane(Record):
 
 
 class Box(Record):
-    """An upright box: its z axis points up, its yaw fits the points.
+    """An upright box: its z axis points up, its yaw fits the points of the object.
 
     Attributes
     ----------

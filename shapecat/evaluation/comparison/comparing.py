@@ -274,8 +274,8 @@ def _differences(
 def _kind(tally: Tally, a: LabelledItem, b: LabelledItem, f: float | None) -> str | None:
     """Return the most serious difference of a pair, None if there is none.
 
-    ``a`` is the found object, ``b`` the true one, ``f`` the overlap F of their masks. Note its
-    track in ``tally.last_tracks``.
+    ``a`` is the found object, ``b`` the true one, ``f`` the overlap F of their masks. Notes the
+    track of ``a`` in ``tally.last_tracks``.
     """
     switched = False
     if a.track is not None and b.track is not None:

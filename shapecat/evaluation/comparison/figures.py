@@ -140,7 +140,10 @@ def _balanced(pairs: Sequence[tuple[str, str]]) -> float | None:
 
 
 def _tracking(seen: Sequence[FrameIdentities], threshold: float) -> dict[str, Any]:
-    """Return the rounded tracking metrics by name; a pair may match from ``threshold`` on."""
+    """Return the tracking metrics by name, rounded; None for undefined ones.
+
+    ``threshold`` is the lowest similarity of a matching pair, for MOTA and IDF1.
+    """
     figures = compute_tracking_metrics(seen, threshold=threshold)._asdict()
     return {
         name: None if value != value else round(value, 4)  # noqa: PLR0124  NaN

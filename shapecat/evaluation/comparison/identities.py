@@ -90,7 +90,10 @@ def compute_tracking_metrics(
 
 
 def _clear_mot(frames: Iterable[FrameIdentities], threshold: float) -> Counter[str]:
-    """Count misses, false positives and switches; pairs stay matched for as long as possible."""
+    """Count objects, misses, false positives and switches.
+
+    A pair stays matched while its similarity is at least ``threshold``.
+    """
     last: dict[Hashable, Hashable] = {}
     counts: Counter[str] = Counter()
     for frame in frames:

@@ -49,9 +49,10 @@ class CocoLabels(Reference[_Image]):
 
     An image names its frame by ``stamp_ns`` (with ``frame`` where stamps repeat), by ``frame``, or
     by a number in its ``file_name``: a timestamp in nanoseconds, else the last number, which is
-    the frame number. An image without ``topic`` matches any topic. If the images are of several
-    recordings, only those whose ``recording`` is the name of the ``run`` are used. If some of these
-    have the ``digest`` of the run's recording, only they are used.
+    the frame number. An image without ``topic`` matches any topic. If the images name several
+    recordings, only those whose ``recording`` is the name of the ``run`` are used; if there are
+    none, `RecordingError` is raised. If any of the used images have the ``digest`` of the run's
+    recording, the others are left out.
     """
 
     kind, unit = "COCO labels", "images"

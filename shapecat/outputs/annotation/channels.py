@@ -15,7 +15,7 @@ def encoder_for(encoding: str, *, markers: bool) -> Encoders[Annotation]:
     """Return the annotation channels for an encoding, each with its encoder.
 
     An unknown encoding is replaced by JSON. ``markers`` adds a channel for RViz if the encoding
-    is one of ROS.
+    is a ROS encoding.
     """
     kinds = [
         MessageKind("/shapecat/detections", "vision_msgs/msg/Detection3DArray", _detections),

@@ -48,7 +48,7 @@ class MessageKind(NamedTuple, Generic[_T]):
     """The messages of a channel: topic, name of the type, and the function that makes a message.
 
     ``name`` is a Foxglove type, such as ``foxglove.SceneUpdate``, which is written in all
-    encodings, or a ROS type, which is written only in the encodings of ROS.
+    encodings, or a ROS type, which is written only in ROS encodings.
     """
 
     topic: str

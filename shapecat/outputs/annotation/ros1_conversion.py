@@ -76,7 +76,10 @@ def convert_channel(channel: Channel) -> _ConvertedChannel | None:
 
 @lru_cache(_KEPT)
 def _ros2_types(channel: Channel, name: str) -> tuple[Typestore, bytes]:
-    """Return the types of a channel for ROS 2, and the ROS 2 definition of the type ``name``."""
+    """Return the message types of a channel for ROS 2, and the definition of its own type.
+
+    ``name`` is the name of this type in ROS 2.
+    """
     types = dict(typestore_of(channel).fielddefs)
     if name != channel.type:
         types[name] = types.pop(channel.type)

@@ -161,7 +161,10 @@ def images_of(
 
 
 def _is_sure(item: LabelledObject, selection: Selection, corrected: set[int]) -> bool:
-    """Return whether the label of an object is certain enough for training; *unknown* never is."""
+    """Return whether the label of an object is certain enough for training; *unknown* never is.
+
+    ``corrected`` are the numbers of the tracks that a person labelled.
+    """
     if item.category == UNKNOWN:
         return False
     certain = item.confidence >= selection.min_confidence and not selection.corrected_only
@@ -262,7 +265,11 @@ def thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFra
 
 
 def _view(labelled: LabelledFrame, item: LabelledObject) -> F8:
-    """Return features (8,) of a view: direction, distance, number of pixels, and shape."""
+    """Return features (8,) of a view, scaled so that their differences are comparable.
+
+    They are the direction to the sensor (3), the logarithms of distance and number of pixels, and
+    the relative lengths of the box (3).
+    """
     pose, center = labelled.fixed_from_sensor, np.asarray(item.box.center, np.float64)
     distance = float(np.linalg.norm(center))
     way = -center / max(distance, 1e-6)
@@ -273,9 +280,9 @@ def _view(labelled: LabelledFrame, item: LabelledObject) -> F8:
 
 
 def _different(views: F8, count: int) -> list[int]:
-    """Return the indices of ``count`` views (n, 8) that differ most.
+    """Return the indices of up to ``count`` views that differ most, by farthest-point sampling.
 
-    They are found by farthest-point sampling, which starts with the view of most pixels.
+    ``views`` (n, 8) are from `_view`. The first to be chosen is the one with the most pixels.
     """
     chosen = [int(views[:, 4].argmax())]
     apart = np.linalg.norm(views - views[chosen[0]], axis=1)

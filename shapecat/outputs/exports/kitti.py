@@ -114,7 +114,10 @@ def kitti_type(category: str) -> str:
 
 
 def _label(item: LabelledObject, frame: Frame, turn: F8, view: _View) -> str:
-    """Return a line of 15 values: type truncated occluded alpha bbox(4) h w l x y z rotation_y."""
+    """Return a line of 15 values: type truncated occluded alpha bbox(4) h w l x y z rotation_y.
+
+    ``turn`` (3, 3) is from `rectified_from_sensor`.
+    """
     length, width, height = map(float, item.box.size)
     x, y, z = turn @ item.box.center
     heading = turn @ rotation_from_quaternion(item.box.orientation)[:, 0]

@@ -83,7 +83,7 @@ def card_html(card: Card, categories: Sequence[str], names: Sequence[str], end: 
     Parameters
     ----------
     categories : in the order of the posterior.
-    names : all categories, starting with unknown; the index of a category is its digit key.
+    names : all categories, unknown first; the digit keys 0 to 9 assign the first ten.
     end : time at the end of the last track, seconds since the first frame.
     """
     row, line = card.row, card.timeline

@@ -43,7 +43,7 @@ class TrackPictures(NamedTuple):
 
 
 class StripFrame(NamedTuple):
-    """A frame as a data URI, its size, and its time in seconds since the first frame.
+    """A frame of the overview strip: data URI, size, and time in seconds since the first frame.
 
     ``boxes`` are left, top, width and height of each track, in pixels of the picture. ``shaded``
     says whether the picture is a shaded depth image instead of a colour image.
@@ -81,7 +81,7 @@ class _Best(NamedTuple):
 
 @dataclass
 class _Collector:
-    """The pictures so far: the best view of each track, and the strip."""
+    """The pictures so far: the best view of each track, and the overview strip."""
 
     choice: Choice
     best: dict[int, _Best] = field(default_factory=dict)
@@ -116,10 +116,10 @@ class _Collector:
 
 
 def take_pictures(finished: FinishedRun, rows: Sequence[TrackRow], choice: Choice) -> Pictures:
-    """Read the chosen frames again and make the pictures.
+    """Read the frames of a choice again and make the pictures.
 
     If the recording cannot be read, tracks get only drawings of their meshes, and there is no
-    strip. ``rows`` are the original rows of tracks.csv.
+    overview strip. ``rows`` are the original rows of tracks.csv.
     """
     collector = _Collector(choice)
     advice = "run `shapecat annotate` with --recording PATH first"
@@ -139,7 +139,7 @@ def take_pictures(finished: FinishedRun, rows: Sequence[TrackRow], choice: Choic
 def _frames(
     finished: FinishedRun, rows: Sequence[TrackRow], choice: Choice
 ) -> Iterator[LabelledFrame]:
-    """Yield the chosen frames; tracks have their original labels, before any correction."""
+    """Yield the frames of a choice; tracks have their original labels, those in ``rows``."""
     labels = {row.track: TrackLabel(row.track, row.category, row.confidence) for row in rows}
     left = set(choice.frames)
     for labelled in read_labelled_frames(finished.folder, labels):

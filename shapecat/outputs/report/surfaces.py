@@ -113,7 +113,10 @@ def _view(azimuth: float, elevation: float) -> F8:
 
 
 def _project(points: F8, view: F8, scale: float) -> F8:
-    """Return column, row and nearness to the viewer (n, 3), pixels."""
+    """Return column, row and nearness to the viewer (n, 3), pixels, of points (n, 3).
+
+    ``view`` (3, 3) is from `_view`; ``scale`` is in pixels per metre.
+    """
     right, up, toward_viewer = (np.asarray(points, np.float64) @ view.T * scale).T
     return np.stack([SIDE / 2 + right, SIDE / 2 - up, toward_viewer], axis=1)
 
@@ -161,7 +164,7 @@ def _closed(heights: F8) -> F8:
 
 
 def _smoothed(heights: F8, bare: Bool) -> F8:
-    """Average each pixel (h, w), even if empty, with its neighbours on the object."""
+    """Average each pixel (h, w), even the empty ones in ``bare``, with those on the object."""
     weight: F8 = (~bare).astype(np.float64)
     value: F8 = np.where(bare, 0.0, heights)
     for _ in range(_PASSES):

@@ -84,7 +84,10 @@ def paint(
 def _shaded(
     frame: Frame, pixels: I4, points: F4, tones: U2, palette: U1, planes: Sequence[Plane]
 ) -> U4:
-    """Return the shaded colours (n,) of points, 0xRRGGBBAA, by object or plane."""
+    """Return the colours (n,) of points, 0xRRGGBBAA; those of a depth image are shaded.
+
+    ``pixels`` (n,) are the flat indices of the points; the other parameters are as in `_colours`.
+    """
     light = np.ones(pixels.size, np.float32)
     if frame.depth is not None and frame.camera is not None:
         light = _light(frame.depth, pixels, frame.camera.fx, frame.camera.fy)
@@ -106,11 +109,11 @@ def _thin(wanted: Bool, limit: int) -> tuple[int, I4]:
     In an image (h, w), the wanted pixels on a grid with this step are chosen. In a cloud (n,),
     every ``step``-th of the wanted points is chosen. A limit of 0 means all.
     """
-    share = np.count_nonzero(wanted) / limit if limit else 1.0
+    ratio = np.count_nonzero(wanted) / limit if limit else 1.0
     if wanted.ndim == 1:
-        step = max(1, math.ceil(share))
+        step = max(1, math.ceil(ratio))
         return step, np.flatnonzero(wanted)[::step]
-    step = max(1, math.ceil(math.sqrt(share)))
+    step = max(1, math.ceil(math.sqrt(ratio)))
     rows, columns = np.nonzero(wanted[::step, ::step])
     return step, (rows * wanted.shape[1] + columns) * step
 

@@ -89,9 +89,9 @@ def _up(labelled: LabelledFrame, frame: Frame) -> F8:
 
 
 def _subject(labelled: LabelledFrame, frame: Frame, pose: Pose) -> tuple[F8, float]:
-    """Return centre (3,) and radius, metres, of the objects, or else of the planes or points.
+    """Return a sphere around the objects, or else around the planes or the points.
 
-    ``pose`` transforms the centre.
+    It is given by its centre (3,), in the frame to which ``pose`` transforms, and radius, metres.
     """
     if labelled.objects:
         half = [np.full(3, o.box.size.max() / 2) for o in labelled.objects]

@@ -282,7 +282,7 @@ def _stacked(rows: Sequence[F8], width: int) -> F8:
 
 
 def _tint(category: str, white: float) -> tuple[int, int, int]:
-    """Return the colour of a category mixed with white."""
+    """Return the colour of a category, mixed with the fraction ``white`` of white."""
     red, green, blue = (round(c + white * (255 - c)) for c in colour_of(category))
     return red, green, blue
 

@@ -60,7 +60,7 @@ class ChunkedRecording(Recording):
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the file and read its index, or scan it without one.
+        """Open the file and read its index; without a usable index, scan the file.
 
         Raises
         ------

@@ -54,7 +54,7 @@ class McapRecording(ChunkedRecording):
     kind: ClassVar[str] = "mcap"
 
     def __init__(self, path: Path) -> None:
-        """Open the file and read its summary, or scan it without one.
+        """Open the file and read its summary; without a usable summary, scan the file.
 
         Raises
         ------

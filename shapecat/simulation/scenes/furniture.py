@@ -172,7 +172,7 @@ def make_compartment(rng: Generator) -> tuple[Support, list[Support], Support]:
 
 
 def _slab(name: str, label: int, size: Sequence[float], top_middle: Sequence[float]) -> Support:
-    """Return a horizontal board; ``top_middle`` (3,) is the centre of its upper face."""
+    """Return a horizontal board of ``size`` (3,); its upper face is centred at ``top_middle``."""
     x, y, z = top_middle
     mesh = moved(rounded_box(size, fine=1), Pose(np.eye(3), np.array([x, y, z - size[2]])))
     a, b = size[0] / 2, size[1] / 2

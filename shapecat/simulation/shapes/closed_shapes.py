@@ -205,7 +205,7 @@ def _flattened(mesh: Mesh, stretch: float, low: float, high: float, neck: float)
 def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
     """Shift the part above z = ``low`` to one side, as the neck of a detergent bottle.
 
-    The shift is ``shift`` from z = ``high`` on, metres, and grows smoothly from ``low``.
+    The shift grows smoothly to ``shift``, metres, at z = ``high``, and is constant above.
     """
     points = np.array(mesh.vertices, np.float64)
     t = np.clip((points[:, 2] - low) / (high - low), 0, 1)

@@ -52,7 +52,7 @@ def _pot(rng: Generator) -> Mesh:
 
 
 def _spout(way: list[list[float]], narrowest: float) -> Mesh:
-    """Return a spout along points (3,), metres, which tapers to the radius ``narrowest``."""
+    """Return a spout along ``way`` (n, 3), metres, which tapers to the radius ``narrowest``."""
     return tube(smooth_path(way, 10), np.linspace(narrowest + 0.009, narrowest, 10))
 
 

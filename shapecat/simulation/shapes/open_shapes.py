@@ -20,7 +20,7 @@ def make_cup(rng: Generator) -> Mesh:
         ["mug", "glass", "beaker", "teacup", "barrel", "espresso"],
         p=[0.34, 0.2, 0.1, 0.14, 0.14, 0.08],
     )
-    ratio, shares = {
+    ratio, radii = {
         "mug": (rng.uniform(0.85, 1.35), [rng.uniform(0.85, 1.0), rng.uniform(0.97, 1.02), 1.0]),
         "glass": (rng.uniform(1.0, 2.1), [rng.uniform(0.62, 1.0), rng.uniform(0.85, 1.0), 1.0]),
         "beaker": (rng.uniform(1.2, 2.3), [rng.uniform(0.6, 0.85), rng.uniform(0.8, 0.93), 1.0]),
@@ -35,7 +35,7 @@ def make_cup(rng: Generator) -> Mesh:
     wall = rng.uniform(0.0015, 0.006) * min(1.0, diameter / 0.06)
     floor, foot = wall * rng.uniform(1, 2.5), _foot(rng, 0.3, 0.004)
     height = ratio * diameter + floor + foot[1]
-    outer = _wall(shares, diameter / 2, height, power=rng.uniform(0.8, 1.2))
+    outer = _wall(radii, diameter / 2, height, power=rng.uniform(0.8, 1.2))
     profile = _hollow(outer, wall, floor=floor, foot=foot)
     section = _section(rng, oval=0.03, square=0.05, facets=0.06)
     body = lathe(profile, **section)
@@ -120,15 +120,15 @@ def make_plate(rng: Generator) -> Mesh:
     return standing(with_random_yaw(standing(lathe(profile, **section)), rng))
 
 
-def _wall(shares: ArrayLike, radius: float, height: float, *, power: float) -> F8:
-    """Return the outer profile (radius, z) of a vessel from bottom to top.
+def _wall(radii: ArrayLike, radius: float, height: float, *, power: float) -> F8:
+    """Return the outer profile of a vessel from bottom to top: radius and z (m, 2), metres.
 
-    ``shares`` (k,) are radii relative to the largest one, which is ``radius``. They are evenly
-    spaced in height for a ``power`` of 1, and closer to the bottom for a larger one.
+    ``radii`` (k,) are relative to the largest one, which is ``radius``. They are evenly spaced in
+    height for a ``power`` of 1, and closer to the bottom for a larger one.
     """
-    shares = np.asarray(shares, np.float64)
-    heights = np.linspace(0, 1, len(shares)) ** power
-    path = smooth_path(np.stack([shares, heights], -1), 14)
+    radii = np.asarray(radii, np.float64)
+    heights = np.linspace(0, 1, len(radii)) ** power
+    path = smooth_path(np.stack([radii, heights], -1), 14)
     path[:, 0] = path[:, 0] / path[:, 0].max() * radius
     path[:, 1] = (
         np.linspace(0, height, len(path))
@@ -152,7 +152,7 @@ def _foot(rng: Generator, chance: float, tallest: float) -> tuple[float, float]:
 def _hollow(
     outer: F8, wall: float, *, floor: float, foot: tuple[float, float], lip: float = 0.0
 ) -> F8:
-    """Return the closed profile (radius, z) of a vessel: foot, outside, rim, inside.
+    """Return the closed profile of a vessel, radius and z (m, 2): foot, outside, rim, inside.
 
     ``outer`` is from `_wall` and ``foot`` from `_foot`. ``wall`` and ``floor`` are thicknesses,
     ``lip`` is the width of a flared rim, all in metres.
