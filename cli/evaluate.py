@@ -20,9 +20,9 @@ from .render import note_off_support, print_json, progress_bars
     "--baselines",
     type=ANY_PATH,
     metavar="TRAINING_SET",
-    help="Train shapecat's model and simpler classifiers on these views and compare them on "
-    "DATASET. If TRAINING_SET is DATASET, use cross-validation by instance with up to five folds; "
-    "it needs two objects of each category.",
+    help="Also train shapecat's classifier and the baselines on TRAINING_SET and test them on "
+    "DATASET. The two must share no view, or be the same folder: then cross-validate by instance "
+    "in up to five folds, with at least two instances per category.",
 )
 @json_option
 def evaluate(
@@ -30,9 +30,9 @@ def evaluate(
 ) -> None:
     """Evaluate a model on labelled views of objects.
 
-    Print accuracy, confusion matrix, calibration error and novelty detection, and the accuracy
-    after fusing 3, 10 and 30 views of an instance. DATASET is laid out as for `shapecat train`.
-    The model must know every category of DATASET.
+    Print accuracy, confusion matrix, calibration error, the AUROC of novelty detection, and the
+    accuracy after fusing 3, 10 and 30 views of an instance. DATASET is laid out as for
+    `shapecat train`. The model must know every category of DATASET.
 
     \b
     --baselines compares these classifiers with shapecat's own:

@@ -48,12 +48,14 @@ _NO_VAL = (
     type=click.FloatRange(0, 1),
     default=0.0,
     metavar="CONFIDENCE",
-    help="coco, yolo: label only objects with at least this confidence, or labelled by a person.",
+    help="coco, yolo: only objects with at least this confidence, or labelled by a person, are "
+    "reliable. coco marks the others as iscrowd, yolo leaves them out; images without a reliable "
+    "object are left out.",
 )
 @click.option(
     "--corrected-only",
     is_flag=True,
-    help="coco, yolo: label only objects whose track a person has labelled.",
+    help="coco, yolo: only objects whose track a person has labelled are reliable.",
 )
 @click.option(
     "--depth", is_flag=True, help="coco, yolo: export 16-bit depth images instead of colour images."

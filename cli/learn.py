@@ -22,10 +22,9 @@ def learn(
 ) -> None:
     """Add the new categories of a data set to a model.
 
-    MODEL is a model file, or `default` for the model that comes with shapecat. Its existing
-    categories do not change. DATASET is laid out as for `shapecat train`, with z up and the support
-    at z = 0; `shapecat export --format crops` writes such a data set. Views of `unknown` are not
-    used.
+    MODEL is a model file, or `default` for the model that comes with shapecat. Its classifiers of
+    existing categories do not change. DATASET is laid out as for `shapecat train`;
+    `shapecat export --format crops` writes such a data set. Views of `unknown` are not used.
 
     \b
     shapecat learn default crops --out mine.npz

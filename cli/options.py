@@ -13,7 +13,7 @@ import click
 class _NonEmptyPath(click.Path):
     """A path that is not empty: an unset shell variable must not mean the current folder.
 
-    ``~`` is the home folder even where the shell leaves it, as Bash does in ``--out=~/results``.
+    ``~`` is the home folder even if the shell does not expand it, as in ``--out=~/results``.
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -62,7 +62,7 @@ array_option = click.option(
     "--json",
     "as_json",
     is_flag=True,
-    help="Print a JSON array with one object per recording that did not fail.",
+    help="Print a JSON array with an entry for each recording that did not fail.",
 )
 config_option = click.option(
     "--config", type=ANY_PATH, help="TOML file with settings, listed in docs/reference.md."
@@ -85,7 +85,7 @@ model_option = click.option(
     "--model",
     type=ANY_PATH,
     callback=none_if_default,
-    help="Model file; by default `default`, the model that comes with shapecat.",
+    help="Model file; if not given, or `default`, the model that comes with shapecat.",
 )
 
 

@@ -78,7 +78,8 @@ if TYPE_CHECKING:
 @click.option(
     "--shard",
     metavar="I/N",
-    help="Process part I of N, for job arrays. Number the jobs 0 to N-1, or 1 to N.",
+    help="Process only part I of N, for job arrays. I counts from 1 to N, or from 0 to N-1; parts "
+    "0 and N are the same.",
 )
 @choice_option(
     "--progress",

@@ -34,7 +34,8 @@ def report(
     a folder of runs, also get an index.html in the folder that contains them all. A page needs no
     network and can be mailed. Download the corrected table from it and apply it with
     `shapecat annotate`. With --serve, the page writes corrections to RUN/tracks.csv as you make
-    them. If a recording was moved, first run `shapecat annotate RUN --recording PATH`.
+    them; `shapecat annotate RUN` then applies them to the other files. If a recording was moved,
+    first run `shapecat annotate RUN --recording PATH`.
 
     \b
     shapecat report results
