@@ -164,7 +164,7 @@ class LateExecutor(Executor):
 
 @pytest.fixture
 def late_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Send frames to another process from the first frame on, as many as it may hold."""
+    """Send all frames, even the first ones, to another process, as many as it may hold."""
     monkeypatch.setattr("shapecat.executors.ordered_pool._ITEMS_BEFORE_START", 0)
     monkeypatch.setattr("shapecat.executors.ordered_pool.LocalExecutor", LateExecutor)
 

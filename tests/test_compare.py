@@ -482,7 +482,7 @@ def test_page_without_differences_has_no_empty_table() -> None:
 
 
 def test_page_shows_all_content_in_its_place() -> None:
-    """The content is text, tables, and captions in the picture."""
+    """Text, tables and captions are written in this order, with HTML characters escaped."""
     page = format_page(worked())
     figures, rows = (
         [re.findall(r"<t[hd]>(.*?)</t[hd]>", row) for row in re.findall(r"<tr>(.*?)</tr>", table)]

@@ -329,7 +329,7 @@ def test_indices_refer_to_depth_of_the_frame_itself() -> None:
 
 @pytest.fixture
 def job(tmp_path: Path) -> Job:
-    """Return a job that fuses three frames, and has another setting to pass on."""
+    """Return a job that fuses three frames; another setting must reach the other processes."""
     settings = with_overrides(Settings(), ["detection.fuse_frames=3", "surface.neurons=30"])
     source = record(tmp_path / "table.mcap", 40)
     return Job(source, tmp_path / "one", settings=settings, mcap=False, rrd=False)

@@ -62,7 +62,7 @@ def check(names: tuple[str, ...], out: F4, wanted: dict[str, float]) -> None:
 
 
 def widths(surface: Surface) -> F8:
-    """Return the widths (16,) in directions from that of the sensor on, counterclockwise."""
+    """Return the widths (16,) counterclockwise, the first in the direction of the sensor."""
     angles = np.arctan2(surface.eye[1], surface.eye[0]) + np.arange(16) * np.pi / 16
     directions = np.stack([np.cos(angles), np.sin(angles)])
     return np.asarray(np.ptp(surface.points[:2].T @ directions, axis=0))

@@ -176,7 +176,7 @@ def test_small_top_of_object_is_no_supporting_plane(seed: int, label: int) -> No
 
 @pytest.mark.parametrize("seed", [29, 121, 189])
 def test_floor_strip_beside_table_is_a_plane(seed: int) -> None:
-    """Less of it is visible than of most boards."""
+    """Less of the floor is visible than of most boards, but it must not be left out."""
     rng = np.random.default_rng(seed)
     world = make_scene("empty", rng, frames=1)
     frame, _ = render_frame(world, 0, rng=rng, sensor=KINECT)

@@ -50,7 +50,7 @@ def replace(path: Path, old: bytes, new: bytes, nth: int = 0) -> None:
 
 @pytest.mark.parametrize(("opcode", "warned"), [(0x40, True), (0x90, False)])
 def test_records_of_unknown_kind_are_skipped(tmp_path: Path, opcode: int, warned: bool) -> None:
-    """Opcodes from 0x80 on are for private use; a later format might define the others."""
+    """Opcodes of 0x80 and above are for private use; a later format might define the others."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, "", use_chunking=False, index_types=IndexType.NONE) as writer:
         channel = writer.register_channel("/a", "raw", 0)

@@ -614,7 +614,7 @@ def test_intrinsics_of_another_resolution_cause_warning(
 def test_slight_distortion_is_ignored_and_strong_is_corrected(
     tmp_path: Path,
 ) -> None:
-    """An unrectified image has no pinhole camera; its points must still be right."""
+    """No pinhole camera fits a strongly distorted image; its points must still be right."""
     depth = np.full((48, 64), 1000, np.uint16)
     slight = [("/depth/camera_info", 0, info(EPOCH, d=(1e-4, 0, 0, 0, 0)))]
     strong = [("/depth/camera_info", 0, info(EPOCH, d=(-0.3, 0.1, 0.001, -0.002, 0)))]
