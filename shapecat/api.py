@@ -181,7 +181,7 @@ def process(
 
 
 def perceive(
-    reading: ArrayLike,
+    reading: ArrayLike | Frame,
     intrinsics: ArrayLike | Camera | None = None,
     *,
     up: Sequence[float] | None = None,
@@ -189,7 +189,7 @@ def perceive(
     config: str | Path | None = None,
     **settings: Any,
 ) -> RunFrame:
-    """Find and categorize the objects of one depth image or point cloud.
+    """Find and categorize the objects of one depth image, point cloud or frame.
 
     Nothing is tracked and nothing is written; the result depends only on the arguments. The first
     call after an installation compiles kernels for about a minute.
@@ -198,7 +198,8 @@ def perceive(
     ----------
     reading : a depth image (h, w) along the optical axis, floats in metres or integers in
         millimetres; or points (n, 3) or (h, w, 3) in the sensor frame, metres. Zero, negative and
-        non-finite depth, non-finite points, and values that NumPy masks are missing.
+        non-finite depth, non-finite points, and values that NumPy masks are missing. Or a frame
+        of a recording, which needs no intrinsics.
     intrinsics : fx, fy, cx, cy of the depth image, pixels, or its camera matrix (3, 3), or the
         `Camera` of a frame.
     up : (3,) up direction in the sensor frame; None to estimate it from planes.

@@ -28,7 +28,7 @@ from shapecat.errors import ConfigError, ModelError, OutputError, RecordingError
 from shapecat.learning import load_model, save_model
 from shapecat.outputs.opened_run import Table
 from shapecat.runs.labels.corrections import adopt_labels
-from shapecat.types import Camera
+from shapecat.types import Camera, Frame
 from tests import messages
 from tests.conftest import Guesser
 from tests.loading import loaded_by
@@ -225,6 +225,18 @@ def test_perceived_frame_has_all_that_was_found(monkeypatch: pytest.MonkeyPatch)
     )
 
 
+def test_frame_of_recording_is_perceived_as_it_is(image: Any) -> None:
+    """Without its intrinsics or its stamp, a frame would give other objects, or none to match."""
+    of_frame = shapecat.perceive(image)
+    of_depth = shapecat.perceive(image.depth, image.camera)
+
+    assert of_frame.reading is image
+    assert of_frame.stamp_ns == of_frame.labelled.stamp_ns == image.stamp_ns > 0
+    assert [o.category for o in of_frame.objects] == [o.category for o in of_depth.objects]
+    for one, other in zip(of_frame.objects, of_depth.objects, strict=True):
+        np.testing.assert_array_equal(one.indices, other.indices)
+
+
 def test_masked_values_are_missing(image: Any) -> None:
     """What users masked, say all beyond their table, was perceived without notice."""
     far = image.depth > np.median(image.depth)
@@ -327,6 +339,11 @@ class OnGpu:
         (np.ones((4, 6, 3)), {"intrinsics": (5, 5, 3, 2)}, r"depth image \(h, w\)"),
         ([[1, 2], [3]], {"intrinsics": (5, 5, 3, 2)}, "not an array of numbers: .*inhomogeneous"),
         ([[1, 2, 3], [3]], {}, "not an array of numbers: .*inhomogeneous"),
+        (
+            Frame("/depth", 0, 0, 0, "camera", points=np.ones((9, 3), np.float32)),
+            {"intrinsics": (5, 5, 3, 2)},
+            "a frame has its own intrinsics",
+        ),
         (OnGpu(), {}, r"not an array of numbers: .*cpu\(\)"),
         (np.array([["a"]]), {"intrinsics": (5, 5, 3, 2)}, "depth image"),
         (np.ones((9, 3)), {"up": (0, 0, 0)}, "up: expected a direction"),

@@ -26,8 +26,8 @@ _SHORTEST = 0.05
 """A focal length of at most this fraction of the image's width or height is not in pixels."""
 
 
-def frame_of(reading: ArrayLike, intrinsics: ArrayLike | Camera | None = None) -> Frame:
-    """Return a depth image or points as a frame, with stamp 0.
+def frame_of(reading: ArrayLike | Frame, intrinsics: ArrayLike | Camera | None = None) -> Frame:
+    """Return a depth image or points as a frame, with stamp 0; a frame is returned as it is.
 
     Parameters
     ----------
@@ -37,6 +37,11 @@ def frame_of(reading: ArrayLike, intrinsics: ArrayLike | Camera | None = None) -
     ------
     ConfigError : the shape, the type or a number is wrong, or the unit is not metres.
     """
+    if isinstance(reading, Frame):
+        if intrinsics is not None:
+            msg = "a frame has its own intrinsics; pass its depth to use others"
+            raise ConfigError(msg)
+        return reading
     try:
         values = np.asarray(reading)
     except (TypeError, ValueError) as error:  # rows of different lengths, or a tensor on a GPU
