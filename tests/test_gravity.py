@@ -87,6 +87,19 @@ def test_imu_without_stamps_uses_log_times(tmp_path: Path) -> None:
     assert [None if up is None else up.tolist() for up in found] == [[0, -1, 0], None, [1, 0, 0]]
 
 
+def test_missing_stamps_of_an_imu_are_in_the_clock_of_the_others(tmp_path: Path) -> None:
+    """A simulation begins at 0; at its beginning, there was no acceleration."""
+    items = [
+        ("/imu", EPOCH + stamp, imu(stamp, a, "camera"))
+        for stamp, a in ((0, [0, -9.8, 0]), (7 * SECOND, [9.8, 0, 0]))
+    ]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        up = Upright.of(recording, up="imu", fixed_frame=None).orient(frame(0)).up
+
+    assert up is not None
+    assert up.tolist() == [0, -1, 0]
+
+
 def test_imu_in_the_sensor_frame_needs_no_transform_whatever_the_slash(tmp_path: Path) -> None:
     """Some ROS 1 drivers write ``/camera``, others ``camera``: the accelerations were lost."""
     items = [("/imu", EPOCH, imu(EPOCH, [0, -9.8, 0], "/camera"))]

@@ -443,6 +443,21 @@ def test_transforms_without_stamps_use_log_times(tmp_path: Path) -> None:
     assert buffer.lookup("odom", "base", EPOCH + SECOND // 2).translation[0] == 0.5
 
 
+def test_missing_stamps_of_transforms_are_in_the_clock_of_the_others(tmp_path: Path) -> None:
+    """A simulation begins at 0, and its first pose was taken for one at the log time."""
+    clock = 3 * SECOND  # the log time is not that of the simulation
+    items = [
+        ("/tf", clock + stamp, stamped("odom", "base", x, stamp))
+        for x, stamp in ((1.0, 0), (2.0, SECOND // 10))
+    ]
+    items.insert(0, ("/tf", clock, stamped("odom", "lidar", 7.0, 0)))
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        buffer = read_transforms(recording)
+
+    assert buffer.lookup("odom", "base", SECOND // 20).translation[0] == 1.5
+    assert buffer.lookup("odom", "lidar", 0).translation[0] == 7.0
+
+
 def test_invalid_transforms_are_skipped_and_reported(tmp_path: Path) -> None:
     """A driver without a fix publishes NaN; the pose before it stays valid."""
     items = [

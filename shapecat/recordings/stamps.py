@@ -1,21 +1,22 @@
 """Read the stamps of messages, and warn about unreliable clocks."""
 
+from collections.abc import Iterator
 from contextlib import suppress
-from functools import cached_property
 from itertools import islice
 from typing import Any
 
 from shapecat.recordings.messages import MALFORMED, MessageError
 from shapecat.recordings.recording import Recording
 
-__all__ = ["Clock", "delay_ns", "stamp_ns"]
+__all__ = ["Clock", "Estimates", "stamp_ns"]
 
 _EPOCH_NS = 946_684_800 * 10**9
 """1 January 2000: earlier stamps probably count from when the sensor was switched on."""
 _JUMP_NS = 10 * 10**9
 """Smallest change of the delay between stamp and log time that counts as a jump."""
-_FIRST = 5
-"""Number of messages that `delay_ns` searches for a stamp other than 0."""
+_FIRST = 20
+"""Number of messages of a topic that `Estimates` searches for stamps. A simulation begins at 0, and
+so do the stamps of its first transforms."""
 
 
 def stamp_ns(header: Any) -> int:
@@ -32,19 +33,31 @@ def stamp_ns(header: Any) -> int:
     return stamp
 
 
-def delay_ns(recording: Recording, topic: str) -> int:
-    """Return log time minus stamp (ns) for the first message of a topic with a stamp other than 0.
+class Estimates:
+    """Estimates missing stamps: the log time minus the delay of the first message with a stamp.
 
-    A missing stamp can be estimated as the log time minus this delay. That works for any clock,
-    such as one that counts from the start of a simulation. The delay is 0 if the stamps of the
-    first messages are all 0.
+    That works for any clock, such as one that counts from the start of a simulation.
     """
-    for message in islice(recording.messages([topic]), _FIRST):
-        with suppress(MessageError, *MALFORMED):
-            stamp = stamp_ns(recording.decode(message).header)
-            if stamp:
-                return message.log_time_ns - stamp
-    return 0
+
+    def __init__(self, recording: Recording) -> None:
+        """Prepare estimates; a topic is searched when a stamp is missing for the first time."""
+        self._recording = recording
+        self._delays: dict[str, int] = {}
+
+    def stamp_ns(self, topic: str, log_time_ns: int) -> int:
+        """Return an estimate of the stamp of a message, nanoseconds."""
+        if topic not in self._delays:
+            self._delays[topic] = next(self._delays_of(topic), 0)
+        return max(log_time_ns - self._delays[topic], 0)
+
+    def _delays_of(self, topic: str) -> Iterator[int]:
+        """Yield log time minus stamp (ns) for those of the first messages with a stamp."""
+        for message in islice(self._recording.messages([topic]), _FIRST):
+            with suppress(MessageError, *MALFORMED):
+                decoded = self._recording.decode(message)
+                for part in getattr(decoded, "transforms", [decoded]):
+                    if stamp := stamp_ns(part.header):
+                        yield message.log_time_ns - stamp
 
 
 class Clock:
@@ -56,15 +69,16 @@ class Clock:
         self.last: int | None = None
         self.delay: int | None = None
         self.counts = dict.fromkeys(_TEXTS, 0)
+        self._estimates = Estimates(recording)
 
     def check(self, stamp: int, log_time: int) -> int:
         """Return the stamp of the next message, or an estimate if it is 0; count suspicious stamps.
 
-        The estimate is the log time minus the `delay_ns` of the topic. All times are nanoseconds.
+        All times are nanoseconds.
         """
         if stamp == 0:
             self.counts["zero"] += 1
-            return max(log_time - self._delay_ns, 0)
+            return self._estimates.stamp_ns(self.topic, log_time)
         self.counts["epoch"] += stamp < _EPOCH_NS <= log_time
         self.counts["same"] += stamp == self.last
         self.counts["back"] += self.last is not None and stamp < self.last
@@ -72,10 +86,6 @@ class Clock:
         self.counts["jump"] += self.delay is not None and abs(delay - self.delay) > _JUMP_NS
         self.last, self.delay = stamp, delay
         return stamp
-
-    @cached_property
-    def _delay_ns(self) -> int:
-        return delay_ns(self.recording, self.topic)
 
     def report(self) -> None:
         """Add warnings about suspicious stamps to the recording."""

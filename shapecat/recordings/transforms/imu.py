@@ -10,7 +10,7 @@ from shapecat.errors import RecordingError
 from shapecat.recordings.look_ahead import LookAhead
 from shapecat.recordings.messages import MALFORMED, Message, reason_of
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.stamps import stamp_ns
+from shapecat.recordings.stamps import Estimates, stamp_ns
 
 __all__ = ["Accelerometer", "Accelerometers"]
 
@@ -60,6 +60,7 @@ class Accelerometers:
         """Prepare reading; nothing is read until it is needed."""
         self._recording = recording
         self._found: dict[str, Accelerometer] = {}
+        self._estimates = Estimates(recording)
 
     def measure_anything(self) -> bool:
         """Return whether the recording holds any acceleration; this may read all of it."""
@@ -82,7 +83,8 @@ class Accelerometers:
             return
         try:
             imu = self._recording.decode(message)
-            a, stamp = imu.linear_acceleration, stamp_ns(imu.header) or message.log_time_ns
+            a, stamp = imu.linear_acceleration, stamp_ns(imu.header)
+            stamp = stamp or self._estimates.stamp_ns(message.topic, message.log_time_ns)
             acceleration = np.array([a.x, a.y, a.z], np.float64)
             absent = float(imu.linear_acceleration_covariance[0]) == -1
             name = str(imu.header.frame_id)

@@ -7,7 +7,7 @@ from shapecat.errors import RecordingError
 from shapecat.recordings.decoding.foxglove import ros_counterpart
 from shapecat.recordings.messages import MALFORMED, Message, reason_of
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.stamps import stamp_ns
+from shapecat.recordings.stamps import Estimates, stamp_ns
 from shapecat.recordings.transforms.buffer import TransformBuffer
 from shapecat.recordings.transforms.topics import TF_TYPES, is_latched, transform_topics
 
@@ -46,6 +46,7 @@ class TransformReader:
         self.buffer = buffer
         self.lag_ns = 0
         self._recording = recording
+        self._estimates = Estimates(recording)
 
     def take(self, message: Message) -> None:
         """Add the transforms in a message; invalid ones cause a warning."""
@@ -55,7 +56,9 @@ class TransformReader:
         latched = is_latched(message.type)
         try:
             for transform in self._recording.decode(message).transforms:
-                stamp = stamp_ns(transform.header) or message.log_time_ns
+                stamp = stamp_ns(transform.header)
+                if stamp == 0 and not static:
+                    stamp = self._estimates.stamp_ns(message.topic, message.log_time_ns)
                 times = stamp, message.log_time_ns
                 if not self._add(transform, times, static=static, latched=latched):
                     self._recording.warn("skipped invalid transforms (NaN, no name)")
