@@ -453,6 +453,33 @@ def test_loop_of_other_frames_is_reported_and_ignored(tmp_path: Path) -> None:
     assert warning.startswith("transforms: the frames u < v < u form a loop")
 
 
+@pytest.mark.parametrize(
+    ("second", "warned"),
+    [
+        (("base", 0.305), False),
+        (("base", 0.5), True),
+        (("arm", 0.3), True),
+    ],
+)
+def test_static_transforms_that_differ_are_reported(
+    tmp_path: Path, second: tuple[str, float], *, warned: bool
+) -> None:
+    """A driver and the robot model may disagree: all positions were 20 cm off without a word."""
+    items = [
+        (
+            "/tf_static",
+            EPOCH + k,
+            MAKE.transforms([(parent, "camera", Pose(np.eye(3), np.array([x, 0, 0])))], EPOCH),
+        )
+        for k, (parent, x) in enumerate((("base", 0.3), ("base", 0.3), second))
+    ]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        warnings = Upright.of(recording, up="auto", fixed_frame=None).warnings
+
+    text = "transforms: static ones of camera differ: the last is used for the whole recording"
+    assert warnings == [text] * warned
+
+
 def test_failed_transform_look_ups_are_counted(tmp_path: Path) -> None:
     items = [("/tf", EPOCH, MAKE.transforms([("map", "elsewhere", IDENTITY)], EPOCH))]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:

@@ -16,6 +16,7 @@ from shapecat.recordings.transforms.samples import (
     TOLERANCE_NS,
     TransformSample,
     TransformTrack,
+    are_close,
     interpolated,
     pose_of,
 )
@@ -71,6 +72,7 @@ class TransformBuffer:
         """Make an empty buffer."""
         self._tracks: dict[str, TransformTrack] = {}
         self._frames: set[str] = set()
+        self._replaced: set[str] = set()
 
     def forget(self, stamp_ns: int) -> None:
         """Remove the transforms before a stamp, except the last one of each frame."""
@@ -123,6 +125,8 @@ class TransformBuffer:
         self._frames |= {parent, child}
         track = self._tracks[child]
         if static:
+            if not are_close(track.static or sample, sample):
+                self._replaced.add(child)
             track.static = sample
         else:
             track.latched |= latched
@@ -164,6 +168,12 @@ class TransformBuffer:
             except TransformLoopError as error:
                 return str(error)
         return ""
+
+    def find_replaced(self) -> str:
+        """Return a warning about static transforms that differ; empty if there are none."""
+        names = listed(sorted(self._replaced))
+        found = f"static ones of {names} differ: the last is used for the whole recording"
+        return found if names else ""
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Pose:
         """Return ``target_from_source`` at a time.

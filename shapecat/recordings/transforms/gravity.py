@@ -151,14 +151,14 @@ class Upright:
         if up == "imu" and not (accelerometers and accelerometers.measure_anything()):
             msg = f"--up imu: {recording.path} has no sensor_msgs/Imu with accelerations"
             raise ConfigError(msg)
-        loop = transforms.tree.find_loop()
+        problems = transforms.tree.find_loop(), transforms.tree.find_replaced()
         return cls(
             transforms=transforms,
             fixed_frame=requested,
             vector=vector,
             sources=sources,
             accelerometers=accelerometers,
-            warnings=[f"transforms: {loop}"] if loop else [],
+            warnings=[f"transforms: {problem}" for problem in problems if problem],
             sensors=tuple(stream.frame_id for stream in streams),
             middle_ns=(recording.start_ns + recording.end_ns) // 2,
         )

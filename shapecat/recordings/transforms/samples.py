@@ -12,7 +12,14 @@ from shapecat.geometry import rotation_from_quaternion
 from shapecat.recordings.transforms.delays import Delays
 from shapecat.types import Pose
 
-__all__ = ["TOLERANCE_NS", "TransformSample", "TransformTrack", "interpolated", "pose_of"]
+__all__ = [
+    "TOLERANCE_NS",
+    "TransformSample",
+    "TransformTrack",
+    "are_close",
+    "interpolated",
+    "pose_of",
+]
 
 TOLERANCE_NS = 100_000_000
 """A transform is assumed constant for this long before its first sample and after its last one, and
@@ -92,7 +99,7 @@ class TransformTrack:
             return 0
         others = self._intervals - 1, self._span_ns - min(gap, _LONGEST_NS)
         usual = gap * others[0] <= _UNUSUAL * others[1]
-        return 0 if usual or _are_close(self[at - 1], self[at]) else gap
+        return 0 if usual or are_close(self[at - 1], self[at]) else gap
 
     def add(self, stamp: int, sample: TransformSample) -> None:
         """Insert a sample by time; it replaces one with the same stamp.
@@ -114,7 +121,7 @@ class TransformTrack:
         """Take note of the log time of a sample; compare it with the first one."""
         if self.delays.add(log_time_ns, stamp_ns) and not self.moves:
             self._first = self._first or sample
-            self.moves = not _are_close(self._first, sample)
+            self.moves = not are_close(self._first, sample)
 
     def forget(self, stamp: int) -> None:
         """Remove the samples before a time (ns), except the last one at or before it."""
@@ -134,7 +141,7 @@ def pose_of(sample: TransformSample) -> Pose:
     return Pose(rotation_from_quaternion(sample.quaternion), np.array(sample.translation))
 
 
-def _are_close(a: TransformSample, b: TransformSample) -> bool:
+def are_close(a: TransformSample, b: TransformSample) -> bool:
     """Return whether two samples differ by less than `_MOVED_M` and `_TURNED`."""
     cosine = abs(sum(p * q for p, q in zip(a.quaternion, b.quaternion, strict=True)))
     return (
