@@ -98,6 +98,7 @@ _TEXTS = {
     "zero": "header.stamp is 0 ({}×): it is estimated from the log time",
     "epoch": "header.stamp is not Unix time ({}×): transforms may not match",
     "same": "header.stamp repeats the previous one ({}×): poses and tracks may be wrong",
-    "back": "header.stamp goes backwards ({}×)",
+    "back": "header.stamp goes backwards ({}×): where it does by more than tracking.max_missed_s, "
+    "as in a looped playback, all objects get new tracks",
     "jump": "header.stamp jumps relative to the log time ({}×)",
 }
