@@ -480,6 +480,44 @@ def test_static_transforms_that_differ_are_reported(
     assert warnings == [text] * warned
 
 
+@pytest.mark.parametrize(
+    ("back_s", "moved_m", "warned"),
+    [
+        (20, 0.5, True),
+        (20, 0.0, False),  # a looped playback repeats its transforms
+        (40, 0.5, False),  # no stamp is used twice
+        (1.5, 0.5, False),  # messages of two nodes may come in another order
+    ],
+)
+def test_transforms_with_the_stamps_of_others_are_reported(
+    tmp_path: Path, back_s: float, moved_m: float, *, warned: bool
+) -> None:
+    """A simulation was reset: poses of both sessions were mixed without a word."""
+    times = [(k * SECOND, 0.1 * k) for k in range(30)]
+    again = 30 - back_s, 31 - back_s
+    times += [(round(s * SECOND), 0.1 * s + moved_m) for s in again]
+    items = [
+        (
+            "/tf",
+            EPOCH + k * SECOND,
+            MAKE.transforms(
+                [("map", "camera", Pose(np.eye(3), np.array([x, 0, 0])))], EPOCH + stamp
+            ),
+        )
+        for k, (stamp, x) in enumerate(times)
+    ]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        upright = Upright.of(recording, up="auto", fixed_frame=None)
+        for k in range(len(items)):
+            upright.orient(replace(frame(EPOCH + times[k][0]), log_time_ns=EPOCH + k * SECOND))
+    report_up(upright, tmp_path)
+
+    found = [
+        text for text in upright.warnings if "a clock was set back, and those of camera" in text
+    ]
+    assert len(found) == warned
+
+
 def test_failed_transform_look_ups_are_counted(tmp_path: Path) -> None:
     items = [("/tf", EPOCH, MAKE.transforms([("map", "elsewhere", IDENTITY)], EPOCH))]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:

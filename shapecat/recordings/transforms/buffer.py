@@ -140,6 +140,11 @@ class TransformBuffer:
         """Whether any frame moves."""
         return any(track.moves for track in self._tracks.values())
 
+    @property
+    def contradicted(self) -> list[str]:
+        """The frames whose transforms differ at the same stamps, as a clock was set back."""
+        return sorted(name for name, track in self._tracks.items() if track.contradicted)
+
     def delays_between(self, target: str, source: str) -> list[Delays]:
         """Return the delays of the transforms that move between two frames.
 

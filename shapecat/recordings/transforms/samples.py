@@ -32,6 +32,9 @@ _UNUSUAL = 3
 published rarely has no gaps."""
 _LONGEST_NS = 10_000_000_000
 """Longer intervals count as this long in the mean: what lies between may not have been read."""
+_SET_BACK_NS = 1_000_000_000
+"""A clock was set back if a stamp is farther than this before an earlier one; late messages are
+nearer."""
 _MOVED_M = 0.02
 """Samples that differ by less than this and `_TURNED` are close. Those around a gap are then
 interpolated: the frame was at rest, as in transforms that are published only on change, or
@@ -52,6 +55,8 @@ class TransformTrack:
 
     Attributes
     ----------
+    contradicted : whether a clock was set back, and samples after that differ from those before it
+        with about the same stamps.
     delays : the delays of the samples, which need not be sorted by stamp.
     latched : whether the last transform remains valid for ever.
     moves : whether a sample is not close to the first one; see `_MOVED_M`.
@@ -62,7 +67,7 @@ class TransformTrack:
     def __init__(self) -> None:
         """Start without samples."""
         self.delays = Delays()
-        self.latched = self.moves = False
+        self.contradicted = self.latched = self.moves = False
         self.static: TransformSample | None = None
         self.stamps = array("q")
         self._intervals = self._span_ns = 0  # number and sum of the intervals between samples
@@ -107,6 +112,8 @@ class TransformTrack:
         Of three equal samples in a row, the middle one is dropped.
         """
         at, count = bisect_right(self.stamps, stamp), len(self.stamps)
+        if count and stamp < self.stamps[-1] - _SET_BACK_NS:
+            self.contradicted |= self._differs(at, stamp, sample)
         if at == count > 0 and stamp > self.stamps[-1]:
             self._intervals += 1
             self._span_ns += min(stamp - self.stamps[-1], _LONGEST_NS)
@@ -128,6 +135,11 @@ class TransformTrack:
         first = bisect_right(self.stamps, stamp) - 1
         if first > 0:
             del self.stamps[:first], self._parents[:first], self._numbers[: 7 * first]
+
+    def _differs(self, at: int, stamp: int, sample: TransformSample) -> bool:
+        """Return whether samples near a stamp, of which number ``at`` is next, differ from one."""
+        near = at > 0 and (self.stamps[at - 1] == stamp or self.stamps[at] - stamp <= _GAP_NS)
+        return near and not any(are_close(self[k], sample) for k in (at - 1, at))
 
     def _set(self, at: slice, stamp: int, sample: TransformSample) -> None:
         self.stamps[at] = array("q", [stamp])

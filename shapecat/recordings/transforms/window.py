@@ -68,6 +68,11 @@ class TransformWindow:
         """Whether any frame moves, by the transforms so far."""
         return self._known.moves
 
+    @property
+    def contradicted(self) -> list[str]:
+        """The frames whose transforms so far differ at the same stamps; see the buffer's."""
+        return self._known.contradicted
+
     def delays_between(self, target: str, source: str) -> list[Delays]:
         """Return the delays of the transforms that move between two frames; see the buffer's."""
         return self._known.delays_between(target, source)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from shapecat.errors import listed
 from shapecat.recordings.transforms.gravity import Upright
 from shapecat.runs.tables.placed_frames import count_poses
 from shapecat.runs.tables.reading import keys_of, read_together
@@ -18,8 +19,8 @@ _DISAGREE_DEG = 10
 def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
     """Return the source of the up direction and its agreement with the planes, for run.json.
 
-    Failed look-ups, gaps, their consequences, and large differences are added to the warnings of
-    ``upright``.
+    Failed look-ups, gaps, contradictions, their consequences, and large differences are added to
+    the warnings of ``upright``.
 
     Parameters
     ----------
@@ -34,6 +35,13 @@ def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
         upright.warnings.append(
             f"frames without pose ({upright.in_gaps}×): gaps of up to {gap.gap_s:.2f} s in the "
             f"transforms of {gap.frame_id}, which moves meanwhile"
+        )
+    if upright.transforms.contradicted:
+        frames = listed(upright.transforms.contradicted)
+        upright.warnings.append(
+            f"transforms: a clock was set back, and those of {frames} have the stamps of different "
+            "earlier ones: poses may be those of another time; split the recording where its "
+            "stamps go backwards"
         )
     upright.warnings += _missing_poses(folder, upright)
     uses = upright.given
