@@ -89,6 +89,8 @@ def block(x: int, y: int, w: int, h: int) -> list[int]:
 
 CUP, CAN, BOX = block(0, 0, 4, 5), block(5, 0, 4, 4), block(1, 6, 5, 3)
 LESS = block(5, 0, 4, 3)
+CORNERS = [0, 0, 4, 0, 4, 5, 0, 5]
+"""The outline of CUP, x and y of each corner."""
 FOUND: list[list[tuple[int | None, list[int], str]]] = [
     [(1, CUP, "cup"), (2, LESS, "can")],
     [(1, CUP, "cup"), (2, LESS, "can"), (3, BOX, "box")],
@@ -1095,7 +1097,7 @@ def test_coco_masks_are_read_in_all_forms(shapecat: Run, run: Path) -> None:
     changes = np.flatnonzero(np.diff(np.concatenate([[False], columns, [False]]).astype(int)))
     counts = np.diff([0, *changes.tolist(), 100]).tolist()
     forms: list[Any] = [
-        [[0, 0, 4, 0, 4, 5, 0, 5]],
+        [CORNERS],
         {"size": [10, 10], "counts": counts},
         {"size": [10, 10], "counts": compressed(counts)},
     ]
@@ -1118,6 +1120,29 @@ def test_coco_masks_are_read_in_all_forms(shapecat: Run, run: Path) -> None:
     assert found["overlap"]["recall"] == 1
     assert found["category"]["accuracy"] == 1
     assert found["tracking"]["switches"] == 1
+
+
+def test_categories_that_the_model_lacks_are_named(run: Path) -> None:
+    """Labels of another tool, say Cup for cup, left the table without metrics of categories."""
+    content = {
+        "categories": [{"id": 4, "name": "Cup"}, {"id": 5, "name": "cup"}],
+        "images": [
+            {"id": k, "file_name": f"{START + STEP * k}.png", "width": 10, "height": 10}
+            for k in range(3)
+        ],
+        "annotations": [
+            {"id": k, "image_id": k, "category_id": 4 + (k > 1), "segmentation": [CORNERS]}
+            for k in range(3)
+        ],
+    }
+    (run.parent / "coco.json").write_text(json.dumps(content))
+    found = compare(run, run.parent / "coco.json")
+
+    assert found.figures["category"]["n"] == 1
+    assert found.notes[-1] == (
+        "The metrics of categories leave out 2 matched objects of Cup: the model has no such "
+        "category."
+    )
 
 
 def compressed(counts: list[int]) -> str:

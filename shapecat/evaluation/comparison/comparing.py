@@ -32,12 +32,13 @@ from shapecat.evaluation.comparison.references import (
     repeated_stamps,
     run_labellings,
 )
+from shapecat.outputs.counts import plural
 from shapecat.runs.finished import FinishedRun, open_source
 from shapecat.runs.perceive.selection import read_frames
 from shapecat.runs.run_info import Options
 from shapecat.runs.tables.reading import Key
 from shapecat.system.progress import Observer, ignore
-from shapecat.types import Frame
+from shapecat.types import UNKNOWN, Frame
 
 __all__ = ["Comparison", "compare"]
 
@@ -121,6 +122,8 @@ def compare(
             f"Hardly any object matches: is {reference} from the same recording? Labels of images "
             "must be of its depth images (--format coco --depth)."
         )
+    categories = finished.info["model"]["categories"]
+    notes += _categories_left_out(tally, categories)
     return Comparison(
         run=str(folder),
         reference=str(reference),
@@ -131,7 +134,7 @@ def compare(
                 "only_in_run": tally.only_run,
                 "only_in_reference": max(other.frames - tally.frames, 0),
             },
-            **figures_of(tally, finished.info["model"]["categories"], tracked=other.tracked),
+            **figures_of(tally, categories, tracked=other.tracked),
         },
         rows=tuple(tally.rows),
         pictures=tuple(tally.pictures[k] for k in sorted(tally.pictures)),
@@ -160,6 +163,16 @@ def _hardly_matches(rows: Sequence[Difference]) -> bool:
     found, true = (Counter(row.difference for row in rows)[kind] for kind in ("surplus", "missed"))
     matched = len(rows) - found - true
     return min(found, true) > 0 and matched < _DOUBTFUL * (matched + min(found, true))
+
+
+def _categories_left_out(tally: Tally, categories: Sequence[str]) -> list[str]:
+    """Return a note if matched objects have a true category that the model does not know."""
+    others = [pair.truth for pair in tally.pairs if pair.truth not in (*categories, UNKNOWN)]
+    if not others:
+        return []
+    names = ", ".join(sorted(set(others)))
+    what = f"{plural(len(others), 'matched object')} of {names}"
+    return [f"The metrics of categories leave out {what}: the model has no such category."]
 
 
 def _clouds(
