@@ -121,15 +121,17 @@ def note_off_support(categories: Sequence[str]) -> None:
 def note_skipped(learned: Mapping[str, Any]) -> None:
     """Report on stderr the defective views in the data set of `train` or `learn`.
 
-    These are the number of skipped views, the categories left without views, and the categories
+    These are the number of skipped views, the folders without a usable view, and the categories
     whose views mostly do not stand at z = 0. ``learned`` is the result of `train_on_folder` or
     `learn_on_folder`.
     """
     note_off_support(learned["off_support"])
     if learned["skipped"]:
-        none = f"; no views remain of {', '.join(learned['lost'])}" if learned["lost"] else ""
         views = plural(learned["skipped"], "view")
-        click.echo(f"skipped {views} with too few points for a surface{none}", err=True)
+        click.echo(f"skipped {views} with too few points for a surface", err=True)
+    if learned["lost"]:
+        names = ", ".join(learned["lost"])
+        click.echo(f"Warning: {names}: no usable views (.pcd, .ply or .npz)", err=True)
 
 
 def missed_words(missed: Mapping[str, Any]) -> str:

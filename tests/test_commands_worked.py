@@ -420,14 +420,14 @@ CALLS = {
         "shapecat.evaluation.training.learn_on_folder",
         [None, Path("data"), Path("m.npz")],
         {"seed": 5},
-        {"added": ["jar", "mug"], "views": 1075, "skipped": 0, "off_support": []},
+        {"added": ["jar", "mug"], "views": 1075, "skipped": 0, "lost": [], "off_support": []},
         "m.npz: learned jar, mug from a data set of 1,075 views\n",
     ),
     "train data --out m.npz --seed 5": (
         "shapecat.evaluation.training.train_on_folder",
         [Path("data"), Path("m.npz")],
         {"seed": 5},
-        {"categories": ["cup", "can"], "views": 1, "skipped": 0, "calibrated": True,
+        {"categories": ["cup", "can"], "views": 1, "skipped": 0, "lost": [], "calibrated": True,
          "off_support": []},
         "m.npz: 1 view of cup, can\n",
     ),
@@ -519,7 +519,7 @@ def test_options_are_passed_on_and_results_printed(
         ({"skipped": 1}, "skipped 1 view with too few points for a surface\n"),
         (
             {"skipped": 9, "lost": ["pen", "key"]},
-            "skipped 9 views .*; no views remain of pen, key\n",
+            "skipped 9 views .*\nWarning: pen, key: no usable views",
         ),
     ],
 )

@@ -304,10 +304,26 @@ def test_categories_without_usable_views_are_named(trained: Path, tmp_path: Path
     for k in range(3):
         np.savez(dataset / "pen" / "x" / f"{k}.npz", points=np.eye(3) * 0.01)
 
-    with pytest.raises(RecordingError, match="no view of pen has enough points"):
+    with pytest.raises(RecordingError, match="no view of pen with enough points"):
         learn_on_folder(trained, dataset, tmp_path / "m.npz")
     done = train_on_folder(dataset, tmp_path / "m.npz")
     assert (done["lost"], done["skipped"], done["categories"]) == (["pen"], 3, ["box", "ball"])
+
+
+def test_folder_without_views_is_named(
+    shapecat: Callable[..., Result], trained: Path, tmp_path: Path
+) -> None:
+    """Files of another format, or an export that failed, leave a category out of the model."""
+    dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
+    (dataset / "pen" / "x").mkdir(parents=True)
+    (dataset / "pen" / "x" / "0.xyz").write_text("0 0 0\n")
+
+    done = shapecat("train", dataset, "--out", tmp_path / "m.npz")
+    assert (done.exit_code, done.stderr) == (
+        0, "Warning: pen: no usable views (.pcd, .ply or .npz)\n",
+    )  # fmt: skip
+    with pytest.raises(RecordingError, match="no view of pen"):
+        learn_on_folder(trained, dataset, tmp_path / "m2.npz")
 
 
 def test_views_in_another_frame_are_noticed(

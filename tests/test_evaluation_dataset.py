@@ -213,17 +213,18 @@ def test_views_are_sorted_by_path(tmp_path: Path) -> None:
     assert dataset.categories == ("a", "b")
 
 
-def test_category_without_folders_of_objects_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["mug/0.PCD", "mug/red/left/0.PCD"])
+def test_category_without_folders_of_objects_is_refused(tmp_path: Path, name: str) -> None:
     """Its views were left out without notice if other categories had such folders."""
-    for name in ("cup/a/0.pcd", "cup/scan.ply", "mug/0.PCD", ".mug/0.pcd"):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).touch()
-    refused = r"mug/0\.PCD: expected a folder for each object, such as mug/object/0\.PCD"
+    for other in ("cup/a/0.pcd", "cup/scan.ply", name, ".mug/0.pcd"):
+        (tmp_path / other).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / other).touch()
+    refused = r"0\.PCD: expected a folder for each object, such as mug/object/0\.PCD"
 
     with pytest.raises(RecordingError, match=refused):
         read_dataset(tmp_path)
 
-    (tmp_path / "mug" / "0.PCD").unlink()
+    (tmp_path / name).unlink()
     assert read_dataset(tmp_path).files == (tmp_path / "cup" / "a" / "0.pcd",)
 
 

@@ -53,9 +53,13 @@ class View(Record):
 
 @dataclass(frozen=True)
 class Dataset:
-    """The files of a data set; views are read on demand."""
+    """The files of a data set; views are read on demand.
+
+    ``without_views`` names the folders beside the categories that hold no view.
+    """
 
     files: tuple[Path, ...]
+    without_views: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -77,7 +81,7 @@ def read_dataset(root: Path) -> Dataset:
     Raises
     ------
     RecordingError : the folder holds no views, or the views of a category are not in folders of
-        objects.
+        objects, but beside or below them.
     """
     files = tuple(_views_among(root, "*/*/*"))
     if not files:
@@ -86,13 +90,18 @@ def read_dataset(root: Path) -> Dataset:
             f"{root.resolve().name}/cup/red_mug/000.pcd (or .ply, .npz)"
         )
         raise RecordingError(msg)
-    complete = {path.parent.parent for path in files}
-    for path in _views_among(root, "*/*"):
-        if path.parent not in complete and path.is_file():
-            place = Path(path.parent.name, "object", path.name)
-            msg = f"{path}: expected a folder for each object, such as {place}"
-            raise RecordingError(msg)
-    return Dataset(files)
+    categories = {path.parent.parent.name for path in files}
+    folders = {
+        path.name for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")
+    }
+    without_views = sorted(folders - categories)
+    for name in without_views:
+        for path in _views_among(root / name, "**/*"):
+            if path.is_file():
+                place = Path(name, "object", path.name)
+                msg = f"{path}: expected a folder for each object, such as {place}"
+                raise RecordingError(msg)
+    return Dataset(files, tuple(without_views))
 
 
 def _views_among(root: Path, pattern: str) -> list[Path]:

@@ -45,7 +45,7 @@ def train_on_folder(
 
     Returns
     -------
-    Plain values: ``views``, ``skipped``, ``lost`` (categories of which all views were skipped),
+    Plain values: ``views``, ``skipped``, ``lost`` (folders of categories without a usable view),
     ``off_support`` (categories whose objects, in most views, do not stand at z = 0),
     ``categories``, ``model`` (its id), ``calibrated`` (whether enough instances were held out to
     fit the temperature), and ``held_out`` (the report on these instances).
@@ -102,7 +102,7 @@ def learn_on_folder(
     Raises
     ------
     RecordingError : there are no views, one cannot be read, a folder has an invalid name, or all
-        views of the new categories have too few points.
+        views of the new categories have too few points, or there are none.
     ModelError : the model is unusable, or there is no new category, or there are too many.
     OutputError : the result cannot be written.
     """
@@ -112,7 +112,10 @@ def learn_on_folder(
     views = views.where(views.labels != UNKNOWN)
     if not set(views.labels.tolist()) - set(categorizer.categories):
         if new := [name for name in lost if name not in {UNKNOWN, *categorizer.categories}]:
-            msg = f"{root}: no view of {', '.join(new)} has enough points for a surface"
+            msg = (
+                f"{root}: no view of {', '.join(new)} with enough points for a surface; views are "
+                f"files such as {new[0]}/object/000.pcd (or .ply, .npz)"
+            )
             raise RecordingError(msg)
         msg = (
             f"{root}: model {categorizer.model_id} already knows all its categories; "
@@ -165,7 +168,7 @@ def _describe_folder(
 ) -> tuple[DescribedViews, list[str]]:
     """Describe a data set from which a model with the ``known`` categories will learn.
 
-    Return the described views, and the categories that have none.
+    Return the described views, and the names of the folders that have none.
     """
     dataset = read_dataset(root)
     require_category_names(root, dataset.categories, known)
@@ -177,7 +180,8 @@ def _describe_folder(
     views = describe_views(
         dataset, settings=settings, total=len(dataset), phase="train", observe=observe
     )
-    return views, sorted(set(dataset.categories) - set(views.labels.tolist()))
+    folders = {*dataset.categories, *dataset.without_views}
+    return views, sorted(folders - set(views.labels.tolist()))
 
 
 def _summary(views: DescribedViews, lost: list[str], model: Categorizer) -> dict[str, Any]:
