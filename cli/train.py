@@ -43,3 +43,9 @@ def train(*, dataset: Path, out: Path, overwrite: bool, seed: int, as_json: bool
         print_json(result)
     else:
         click.echo(f"{out}: {plural(result['views'], 'view')} of {', '.join(result['categories'])}")
+        held_out = result["held_out"]
+        if held_out["n"]:
+            click.echo(
+                f"trained without {plural(held_out['n'], 'view')} of other objects, it has an "
+                f"accuracy of {held_out['accuracy']:.3f} on them"
+            )

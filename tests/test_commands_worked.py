@@ -428,7 +428,7 @@ CALLS = {
         [Path("data"), Path("m.npz")],
         {"seed": 5},
         {"categories": ["cup", "can"], "views": 1, "skipped": 0, "lost": [], "calibrated": True,
-         "off_support": []},
+         "off_support": [], "held_out": {"n": 0}},
         "m.npz: 1 view of cup, can\n",
     ),
     "export a b --format coco --out o --every 3 --per-track 7 --min-confidence 0.6 "
@@ -529,7 +529,7 @@ def test_train_names_the_defects_of_its_model(
     """Users would trust the confidences, and look for the missing categories in vain."""
     good = {
         "categories": ["cup", "can"], "views": 2, "calibrated": True, "skipped": 0, "lost": [],
-        "off_support": [],
+        "off_support": [], "held_out": {"n": 0},
     }  # fmt: skip
     target = "shapecat.evaluation.training.train_on_folder"
     monkeypatch.setattr(target, lambda *_, **__: good | answer)

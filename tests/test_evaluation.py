@@ -326,6 +326,21 @@ def test_folder_without_views_is_named(
         learn_on_folder(trained, dataset, tmp_path / "m2.npz")
 
 
+def test_train_prints_the_accuracy_on_held_out_objects(
+    shapecat: Callable[..., Result], tmp_path: Path
+) -> None:
+    """Users would evaluate the model on the views it was trained on, and find 100 %."""
+    dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
+
+    done = shapecat("train", dataset, "--out", tmp_path / "m.npz")
+    held_out = train_on_folder(dataset, tmp_path / "m.npz")["held_out"]
+
+    n, accuracy = held_out["n"], held_out["accuracy"]
+    assert done.stdout.splitlines()[1] == (
+        f"trained without {n} views of other objects, it has an accuracy of {accuracy:.3f} on them"
+    )
+
+
 def test_views_in_another_frame_are_noticed(
     shapecat: Callable[..., Result], trained: Path, tmp_path: Path
 ) -> None:
