@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
@@ -12,6 +12,9 @@ from shapecat.outputs.counts import plural
 
 from .options import ANY_PATH, boxes_option, recording_option
 from .render import for_any_reader, progress_bars
+
+if TYPE_CHECKING:
+    from shapecat.runs.finished import FinishedRun
 
 _DATASETS = ("coco", "yolo")
 _BOX_FORMATS = ("kitti", "labelcloud")
@@ -102,7 +105,7 @@ def export(
     shapecat export results --format kitti --out kitti
     shapecat export results --format coco --out coco --min-confidence 0.8
     """
-    from shapecat.runs.finished import find_runs
+    from shapecat.runs.finished import find_runs, read_finished
 
     given = [name for name in chosen if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
     if given and kind not in _DATASETS:
@@ -116,7 +119,10 @@ def export(
         msg = f"--recording is for a single run, not for {len(found)}"
         raise click.UsageError(msg)
     needs_colour = kind in _DATASETS and not chosen["depth"]
-    runs, failed = _usable(found, needs_colour=needs_colour) if len(found) > 1 else (found, False)
+    if len(found) > 1:
+        runs, failed = _usable(found, needs_colour=needs_colour)
+    else:
+        runs, failed = [read_finished(found[0])], False
     if kind in {*_DATASETS, "crops"}:
         _require_distinct_frames(runs)
     else:
@@ -131,7 +137,7 @@ def export(
     ctx.exit(1 if failed else 0)
 
 
-def _usable(folders: Sequence[Path], *, needs_colour: bool) -> tuple[list[Path], bool]:
+def _usable(folders: Sequence[Path], *, needs_colour: bool) -> tuple[list["FinishedRun"], bool]:
     """Return the runs that can be exported, and whether others have errors.
 
     Print to stderr why runs are skipped; end the command if none is left.
@@ -141,10 +147,11 @@ def _usable(folders: Sequence[Path], *, needs_colour: bool) -> tuple[list[Path],
     found, errors = find_usable(folders)
     for error in errors:
         click.echo(f"Error: {error}", err=True)
-    gray = [run.folder for run in found if needs_colour and not run.info["color"]]
-    for folder in gray:
-        click.echo(f"{folder}: skipped: no colour images (--depth exports depth images)", err=True)
-    runs = [run.folder for run in found if run.folder not in gray]
+    gray = [run for run in found if needs_colour and not run.info["color"]]
+    for run in gray:
+        said = "skipped: no colour images (--depth exports depth images)"
+        click.echo(f"{run.folder}: {said}", err=True)
+    runs = [run for run in found if run not in gray]
     if not runs:
         click.echo("Error: no run is left to export", err=True)
         codes = {error.exit_code for error in errors}
@@ -152,7 +159,7 @@ def _usable(folders: Sequence[Path], *, needs_colour: bool) -> tuple[list[Path],
     return runs, bool(errors)
 
 
-def _export_runs(runs: Sequence[Path], kind: str, out: Path, **options: Any) -> None:
+def _export_runs(runs: Sequence["FinishedRun"], kind: str, out: Path, **options: Any) -> None:
     """Export runs one by one."""
     from shapecat.outputs.exports.formats import common_categories, export_run
 
@@ -161,11 +168,15 @@ def _export_runs(runs: Sequence[Path], kind: str, out: Path, **options: Any) -> 
         with progress_bars() as bars:
             count = export_run(run, kind, out, categories=categories, observe=bars, **options)
         with for_any_reader():
-            click.echo(f"{run}: {plural(count, 'labelled view')} in {out}")
+            click.echo(f"{run.folder}: {plural(count, 'labelled view')} in {out}")
 
 
 def _export_dataset(
-    runs: Sequence[Path], kind: str, out: Path, recording: Path | None, chosen: dict[str, Any]
+    runs: Sequence["FinishedRun"],
+    kind: str,
+    out: Path,
+    recording: Path | None,
+    chosen: dict[str, Any],
 ) -> None:
     """Export several runs as one data set."""
     from shapecat.outputs.exports.dataset_frames import Selection
@@ -186,30 +197,30 @@ def _export_dataset(
         )
 
 
-def _require_distinct_names(runs: Sequence[Path]) -> None:
+def _require_distinct_names(runs: Sequence["FinishedRun"]) -> None:
     """Refuse runs with the same name: their exports would collide."""
     from shapecat.errors import OutputError
 
-    names: dict[str, Path] = {}
+    names: dict[str, FinishedRun] = {}
     for run in runs:
-        other = names.setdefault(run.resolve().name, run)
+        other = names.setdefault(run.name, run)
         if other is not run:
             hint = "export them to different folders (--out)"
-            msg = f"{other} and {run} have the same name; {hint}"
+            msg = f"{other.folder} and {run.folder} have the same name; {hint}"
             raise OutputError(msg)
 
 
-def _require_distinct_frames(runs: Sequence[Path]) -> None:
+def _require_distinct_frames(runs: Sequence["FinishedRun"]) -> None:
     """Refuse runs of the same frames: they would be in the data set twice."""
     from shapecat.errors import OutputError
     from shapecat.outputs.exports.crops import Origin
-    from shapecat.runs.finished import read_finished
 
     origins: dict[Path, Origin] = {}
     for run in runs:
-        origin = Origin.of(read_finished(run))
+        origin = Origin.of(run)
         for other, earlier in origins.items():
             if origin.shares_frames(earlier):
-                msg = f"{other} and {run} hold the same frames of a recording; export only one"
+                both = f"{other} and {run.folder}"
+                msg = f"{both} hold the same frames of a recording; export only one"
                 raise OutputError(msg)
-        origins[run] = origin
+        origins[run.folder] = origin

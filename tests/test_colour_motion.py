@@ -20,6 +20,7 @@ from shapecat.pipeline import process
 from shapecat.recordings import TransformBuffer
 from shapecat.recordings.colour_motion import view_at_its_time
 from shapecat.recordings.transforms.window import TransformWindow
+from shapecat.runs.finished import read_finished
 from shapecat.runs.jobs import Job
 from shapecat.runs.tables.masks import read_masks
 from shapecat.simulation import recorder, simulate
@@ -93,7 +94,7 @@ def test_masks_are_where_objects_are_when_colour_image_is_taken(walk: Path) -> N
 
 def test_kitti_boxes_are_on_objects_of_colour_image(walk: Path, tmp_path: Path) -> None:
     """The image in image_2 is that of another time, too; 2D boxes and P2 must fit it."""
-    export_run(walk, "kitti", tmp_path)
+    export_run(read_finished(walk), "kitti", tmp_path)
     truth = true_labels(walk)
     with (tmp_path / "walk" / "frames.csv").open() as file:
         numbers = {int(row["frame"]): row["number"] for row in csv.DictReader(file)}

@@ -706,13 +706,16 @@ sys.exit(5)
 EXPORT = """
 import sys
 from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
 from shapecat.outputs.exports import formats
 from shapecat.runs import finished
 
 finished.find_runs = list
-import_module("shapecat.cli.export")._usable = lambda runs, **_: (runs, False)
+runs = [SimpleNamespace(name=name, folder=Path(name)) for name in "abc"]
+import_module("shapecat.cli.export")._usable = lambda *_, **__: (runs, False)
 formats.common_categories = lambda _: ()
-formats.export_run = lambda run, *_, **__: print(run, file=sys.stderr) or 1
+formats.export_run = lambda run, *_, **__: print(run.name, file=sys.stderr) or 1
 command = import_module("shapecat.cli.main").main
 command(["export", "a", "b", "c", "--format", "kitti", "--out", "out"])
 """

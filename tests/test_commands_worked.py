@@ -407,6 +407,9 @@ def test_plain_progress_shows_done_running_and_remaining(
     ]
 
 
+NAMED = {name: SimpleNamespace(name=name, folder=Path(name)) for name in "ab"}
+"""Stand-ins for finished runs."""
+
 CALLS = {
     "simulate o.mcap --scene shelf --sensor d435 --frames 7 --clouds --color --seed 3": (
         "shapecat.simulation.simulate",
@@ -434,14 +437,14 @@ CALLS = {
     "export a b --format coco --out o --every 3 --per-track 7 --min-confidence 0.6 "
     "--corrected-only --depth --val 0.4": (
         "shapecat.outputs.exports.formats.export_dataset",
-        [[Path("a"), Path("b")], "coco", Path("o"), Selection(3, 7, 0.6, True, True, 0.4)],
+        [[NAMED["a"], NAMED["b"]], "coco", Path("o"), Selection(3, 7, 0.6, True, True, 0.4)],
         {"recording": None},
         Exported(1075, 3, {"train": 1400, "val": 20}),
         "2 runs: 1,075 labelled views in o\n1,400 images in train, 20 in val\n",
     ),
     "export a b --format yolo --out o": (
         "shapecat.outputs.exports.formats.export_dataset",
-        [[Path("a"), Path("b")], "yolo", Path("o"), Selection()],
+        [[NAMED["a"], NAMED["b"]], "yolo", Path("o"), Selection()],
         {"recording": None},
         Exported(7, 0, {"train": 1}),
         (
@@ -452,7 +455,7 @@ CALLS = {
     ),
     "export a --format kitti --out o --every 3 --boxes visible --recording r.bag": (
         "shapecat.outputs.exports.formats.export_run",
-        [Path("a"), "kitti", Path("o")],
+        [NAMED["a"], "kitti", Path("o")],
         {"every": 3, "visible_boxes": True, "recording": Path("r.bag"), "categories": ["of a"]},
         1,
         "a: 1 labelled view in o\n",
@@ -502,10 +505,12 @@ def test_options_are_passed_on_and_results_printed(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(target, stub)
     monkeypatch.setattr("shapecat.runs.finished.find_runs", list)
-    monkeypatch.setattr("shapecat.cli.export._usable", lambda runs, **_: (runs, False))
+    monkeypatch.setattr("shapecat.runs.finished.read_finished", lambda run: NAMED[run.name])
+    usable = "shapecat.cli.export._usable"
+    monkeypatch.setattr(usable, lambda runs, **_: ([NAMED[run.name] for run in runs], False))
     monkeypatch.setattr("shapecat.cli.export._require_distinct_frames", list)
     common = "shapecat.outputs.exports.formats.common_categories"
-    monkeypatch.setattr(common, lambda runs: [f"of {run}" for run in runs])
+    monkeypatch.setattr(common, lambda runs: [f"of {run.name}" for run in runs])
     done = shapecat(*line.split())
 
     assert (done.exit_code, done.stdout) == (0, printed), done.stderr

@@ -82,7 +82,7 @@ def farthest(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_crops_are_a_data_set_with_corrected_labels(run: Path, tmp_path: Path) -> None:
-    count = export_run(run, "crops", tmp_path)
+    count = export_run(read_finished(run), "crops", tmp_path)
 
     views = list(read_dataset(tmp_path))
     by_track: dict[int, list[Any]] = {}
@@ -100,7 +100,7 @@ def test_crops_are_a_data_set_with_corrected_labels(run: Path, tmp_path: Path) -
 
 def test_crops_are_upright_at_height_zero_with_viewpoint(run: Path, tmp_path: Path) -> None:
     """In any other frame, the descriptors would differ."""
-    export_run(run, "crops", tmp_path)
+    export_run(read_finished(run), "crops", tmp_path)
     truth = json.loads(
         (Path(read_finished(run).info["input"]["path"]).with_suffix(".truth.json")).read_text()
     )
@@ -193,11 +193,15 @@ def test_exporting_again_removes_views_with_earlier_labels(run: Path, tmp_path: 
     (own / "view.pcd").write_text("of another data set")
     events: list[tuple[str, int, int | None]] = []
     export_run(
-        folder, "crops", tmp_path / "crops", every=4, observe=lambda *what: events.append(what)
+        read_finished(folder),
+        "crops",
+        tmp_path / "crops",
+        every=4,
+        observe=lambda *what: events.append(what),
     )
     assert events[-1][1:] == (len(events), len(events))  # the progress ends at its total
     relabel(folder, {2: "vase", 3: "delete"})
-    export_run(folder, "crops", tmp_path / "crops", every=4)
+    export_run(read_finished(folder), "crops", tmp_path / "crops", every=4)
 
     places = {path.name: path.parent.name for path in (tmp_path / "crops").glob("*/*.track-*")}
     assert sum(name.endswith("track-2") for name in places) == 1
@@ -210,7 +214,7 @@ def test_exporting_again_removes_views_with_earlier_labels(run: Path, tmp_path: 
 @pytest.mark.parametrize("which", ["", "_full"])
 def test_kitti_boxes_match_tables_within_1_mm(run: Path, tmp_path: Path, which: str) -> None:
     """Detectors are trained on whole objects; visible boxes are optional."""
-    export_run(run, "kitti", tmp_path, visible_boxes=not which)
+    export_run(read_finished(run), "kitti", tmp_path, visible_boxes=not which)
     out = tmp_path / "table"
     camera = intrinsics(run)
     worst, kinds = 0.0, set()
@@ -251,7 +255,7 @@ def test_rectified_camera_is_level(up: tuple[float, ...]) -> None:
 
 def test_labelcloud_formats_agree(run: Path, tmp_path: Path) -> None:
     """Centroid and size are read, or computed from vertices, as in labelCloud 1.1."""
-    export_run(run, "labelcloud", tmp_path, every=3)
+    export_run(read_finished(run), "labelcloud", tmp_path, every=3)
     out = tmp_path / "table"
     worst, count = 0.0, 0
     for cloud in sorted((out / "pointclouds").iterdir()):
@@ -316,18 +320,19 @@ def test_numbers_of_categories_depend_on_their_names_alone(run: Path, tmp_path: 
     for folder, label in zip(runs, ("zebra", "apple"), strict=True):
         shutil.copytree(run, folder)
         relabel(folder, {2: label})
-    names = common_categories(runs)
+    names = common_categories([read_finished(folder) for folder in runs])
     info = read_run(runs[0])
     info["model"]["categories"] += ["zebra"]
     write_run(runs[0], info)
 
     assert names[-2:] == ("apple", "zebra")
-    assert common_categories(runs) == common_categories(runs[::-1]) == names
+    learned = [read_finished(folder) for folder in runs]
+    assert common_categories(learned) == common_categories(learned[::-1]) == names
 
 
 def test_point_labels_match_pixels_of_each_object(run: Path, tmp_path: Path) -> None:
     image = pytest.importorskip("PIL.Image")
-    export_run(run, "point-labels", tmp_path)
+    export_run(read_finished(run), "point-labels", tmp_path)
     out = tmp_path / "table"
     legend = json.loads((out / "labels.json").read_text())
     owner = {
@@ -369,7 +374,7 @@ def test_frames_without_pose_are_left_out(run: Path, tmp_path: Path, format: str
     pq.write_table(table, lost / "frames.parquet")
     tracks = pq.read_table(lost / "tracks.parquet")
     pq.write_table(tracks.filter(pc.greater(tracks["frame"], 0)), lost / "tracks.parquet")
-    export_run(lost, format, tmp_path / "out")
+    export_run(read_finished(lost), format, tmp_path / "out")
 
     with (tmp_path / "out" / "lost" / "frames.csv").open() as file:
         frames = [int(row["frame"]) for row in csv.DictReader(file)]
@@ -381,7 +386,7 @@ def test_export_never_replaces_its_run(run: Path) -> None:
     before = sorted(path.name for path in run.iterdir())
 
     with pytest.raises(OutputError, match="choose another --out"):
-        export_run(run, "kitti", run.parent)
+        export_run(read_finished(run), "kitti", run.parent)
 
     assert sorted(path.name for path in run.iterdir()) == before
 
@@ -392,7 +397,10 @@ def test_export_replaces_only_export_of_same_format(run: Path, tmp_path: Path) -
     info = read_run(folder)
     info["options"] |= {"start_s": 0.0, "end_s": 99.5}
     write_run(folder, info)
-    objects = {export_run(folder, "point-labels", tmp_path / "out", every=6) for _ in range(2)}
+    objects = {
+        export_run(read_finished(folder), "point-labels", tmp_path / "out", every=6)
+        for _ in range(2)
+    }
     out = tmp_path / "out" / "table"
 
     assert len(list((out / "semantic").iterdir())) == 2
@@ -406,7 +414,7 @@ def test_export_replaces_only_export_of_same_format(run: Path, tmp_path: Path) -
         "made": sorted(path.name for path in out.iterdir() if path.name != "export.json"),
     }
     with pytest.raises(OutputError, match="holds point-labels"):
-        export_run(folder, "kitti", tmp_path / "out")
+        export_run(read_finished(folder), "kitti", tmp_path / "out")
 
 
 def test_missing_or_changed_recording_is_refused(run: Path, tmp_path: Path) -> None:
@@ -419,12 +427,12 @@ def test_missing_or_changed_recording_is_refused(run: Path, tmp_path: Path) -> N
     (folder / "run.json").write_text(json.dumps(info))
 
     with pytest.raises(RecordingError):
-        export_run(folder, "crops", tmp_path / "crops")
+        export_run(read_finished(folder), "crops", tmp_path / "crops")
     changed = bytearray(source.read_bytes())
     changed[len(changed) // 3] ^= 1
     copy.write_bytes(changed)
     with pytest.raises(OutputError, match="has changed"):
-        export_run(folder, "crops", tmp_path / "crops")
+        export_run(read_finished(folder), "crops", tmp_path / "crops")
     assert not (tmp_path / "crops").exists()
 
 

@@ -694,9 +694,8 @@ def test_data_set_of_several_recordings_is_not_replaced_by_one_of_them(
         run = {"id": f"id-{name}", **info}
         return SimpleNamespace(name=name, folder=folder, categories=("cup",), info=run)
 
-    monkeypatch.setattr("shapecat.outputs.exports.formats.read_finished", read)
     monkeypatch.setitem(DATASETS, "coco", lambda *_: 3)
-    a, b, c = (tmp_path / name for name in "abc")
+    a, b, c = (read(tmp_path / name) for name in "abc")
     out = tmp_path / "out"
     export_dataset([b, a], "coco", out, Selection())
     for alone in (a, b):

@@ -10,6 +10,7 @@ import pytest
 from click.testing import Result
 
 from shapecat.outputs.exports.formats import export_run
+from shapecat.runs.finished import read_finished
 from shapecat.runs.perceive.clocks import explain_clocks
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.simulation.messages import MessageFactory
@@ -51,7 +52,7 @@ def test_object_seen_by_two_sensors_is_one_track(shapecat: Run, tmp_path: Path) 
     assert sum(both["counts"]["tracks"].values()) == sum(one["counts"]["tracks"].values()) > 3
     assert all(sensors == {DEPTH, POINTS} for sensors in topics.values())
     # Frames of both sensors have equal numbers; their files must not collide.
-    crops = export_run(tmp_path / "both" / "a", "crops", tmp_path / "crops")
+    crops = export_run(read_finished(tmp_path / "both" / "a"), "crops", tmp_path / "crops")
     assert len(list((tmp_path / "crops").glob("*/*/*.pcd"))) == crops > 12
 
 

@@ -26,7 +26,7 @@ from shapecat.outputs.exports.kitti import write_kitti
 from shapecat.outputs.exports.labelcloud import write_labelcloud
 from shapecat.outputs.exports.points import write_point_labels
 from shapecat.outputs.wording import different_names
-from shapecat.runs.finished import FinishedRun, open_source, read_finished
+from shapecat.runs.finished import FinishedRun, open_source
 from shapecat.runs.folder import clear, recover, staged
 from shapecat.runs.labels.meaning import order_categories
 from shapecat.runs.tables.placed_frames import streams_with_poses
@@ -76,7 +76,7 @@ _MARK = "export.json"
 
 
 def export_run(
-    folder: Path,
+    finished: FinishedRun,
     format: str,  # noqa: A002  # the word users know
     out: Path,
     *,
@@ -107,20 +107,20 @@ def export_run(
 
     Raises
     ------
-    OutputError : the folder is not a finished run, the content of the recording has changed, or
-        ``out`` is not writable, is a run, or holds something else.
+    OutputError : the content of the recording has changed, or ``out`` is not writable, is a run,
+        or holds something else.
     RecordingError : the recording is missing or unreadable.
     """
     if (out / "run.json").exists():
         msg = f"{out}: is a run; choose another --out"
         raise OutputError(msg)
-    finished = replace(read_finished(folder), common=tuple(categories))
+    finished = replace(finished, common=tuple(categories))
     total = int(finished.info["counts"]["frames"])
     with open_source(finished.info, recording) as source:
         full = format in BOX_FORMATS and not visible_boxes
         frames = finished.frames_with_full_boxes() if full else finished.frames()
         labelled = observed(frames, "export", total, observe)
-        wanted = _tracked(thinned(labelled, every), streams_with_poses(folder))
+        wanted = _tracked(thinned(labelled, every), streams_with_poses(finished.folder))
         pairs = with_colour(wanted, source, finished.info)
         write = FORMATS[format]
         if format == "crops":
@@ -136,7 +136,7 @@ def export_run(
 
 
 def export_dataset(
-    folders: Sequence[Path],
+    runs: Sequence[FinishedRun],
     format: str,  # noqa: A002  # the word users know
     out: Path,
     selection: Selection,
@@ -156,12 +156,11 @@ def export_dataset(
 
     Raises
     ------
-    OutputError : a folder is not a finished run, a run has no images, no image can be exported, the
-        content of a recording has changed, or ``out`` is not writable or holds something else.
+    OutputError : a run has no images, no image can be exported, the content of a recording has
+        changed, or ``out`` is not writable or holds something else.
     RecordingError : a recording is missing or unreadable.
     """
-    runs = [read_finished(folder) for folder in folders]
-    categories = _common(runs)
+    categories = common_categories(runs)
     total = sum(int(run.info["counts"]["frames"]) for run in runs)
 
     counts, left_out = Counter[str](), Counter[str]()
@@ -200,18 +199,13 @@ def export_dataset(
     return Exported(objects, uncertain, counts)
 
 
-def common_categories(folders: Sequence[Path]) -> tuple[str, ...]:
+def common_categories(runs: Sequence[FinishedRun]) -> tuple[str, ...]:
     """Return the categories of several runs, in an order that depends on their names alone.
 
     Raises
     ------
-    OutputError : a folder is not a finished run, its tracks.csv is invalid, or two runs spell a
-        category differently.
+    OutputError : two runs spell a category differently.
     """
-    return _common([read_finished(folder) for folder in folders])
-
-
-def _common(runs: Sequence[FinishedRun]) -> tuple[str, ...]:
     names = order_categories(name for run in runs for name in run.categories)
     spelled: dict[str, str] = {}
     for name in names:
