@@ -186,7 +186,7 @@ def _export_dataset(
         selection = Selection(**chosen)
         exported = export_dataset(runs, kind, out, selection, recording=recording, observe=bars)
     click.echo(f"{plural(len(runs), 'run')}: {plural(exported.objects, 'labelled view')} in {out}")
-    train, val = (exported.images.get(split, 0) for split in ("train", "val"))
+    train, val = exported.images["train"], exported.images["val"]
     hint = "" if val or not selection.val else f": {_NO_VAL}"
     click.echo(f"{plural(train, 'image')} in train, {val:,} in val{hint}")
     if kind == "yolo" and exported.uncertain:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import nullcontext
@@ -439,14 +440,14 @@ CALLS = {
         "shapecat.outputs.exports.formats.export_dataset",
         [[NAMED["a"], NAMED["b"]], "coco", Path("o"), Selection(3, 7, 0.6, True, True, 0.4)],
         {"recording": None},
-        Exported(1075, 3, {"train": 1400, "val": 20}),
+        Exported(1075, 3, Counter(train=1400, val=20)),
         "2 runs: 1,075 labelled views in o\n1,400 images in train, 20 in val\n",
     ),
     "export a b --format yolo --out o": (
         "shapecat.outputs.exports.formats.export_dataset",
         [[NAMED["a"], NAMED["b"]], "yolo", Path("o"), Selection()],
         {"recording": None},
-        Exported(7, 0, {"train": 1}),
+        Exported(7, 0, Counter(train=1)),
         (
             "2 runs: 7 labelled views in o\n"
             "1 image in train, 0 in val: all frames of a recording go to the same split; export "

@@ -691,7 +691,7 @@ def test_data_set_of_several_recordings_is_not_replaced_by_one_of_them(
 
     def read(folder: Path) -> Any:
         name, info = folder.name, {"counts": {"frames": 1}, "input": {"digest": f"d-{folder.name}"}}
-        run = {"id": f"id-{name}", **info}
+        run = {"id": f"id-{name}", "color": {"/depth": "/color"}, **info}
         return SimpleNamespace(name=name, folder=folder, categories=("cup",), info=run)
 
     monkeypatch.setitem(DATASETS, "coco", lambda *_: 3)

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +48,9 @@ Write = Callable[[Path, Iterable[ExportedFrame], FinishedRun], int]
 and returns the number of objects written."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Exported:
-    """Counts of an exported data set of images.
+    """Counts of an exported data set of images, filled while it is written.
 
     Attributes
     ----------
@@ -59,9 +59,9 @@ class Exported:
     images : number of images in each split.
     """
 
-    objects: int
-    uncertain: int
-    images: Mapping[str, int]
+    objects: int = 0
+    uncertain: int = 0
+    images: Counter[str] = field(default_factory=Counter)
 
 
 FORMATS: dict[str, Write] = {
@@ -160,43 +160,50 @@ def export_dataset(
         changed, or ``out`` is not writable or holds something else.
     RecordingError : a recording is missing or unreadable.
     """
+    gray = [str(run.folder) for run in runs if not (selection.depth or run.info["color"])]
+    if gray:
+        msg = f"{', '.join(gray)}: no colour images (--depth exports depth images)"
+        raise OutputError(msg)
     categories = common_categories(runs)
-    total = sum(int(run.info["counts"]["frames"]) for run in runs)
-
-    counts, left_out = Counter[str](), Counter[str]()
-    uncertain, done = 0, itertools.count(1)
-
-    def tell(*_: object) -> None:
-        observe("export", next(done), total)
-
-    def images() -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
-        nonlocal uncertain
-        gray = [str(run.folder) for run in runs if not (selection.depth or run.info["color"])]
-        if gray:
-            msg = f"{', '.join(gray)}: no colour images (--depth exports depth images)"
-            raise OutputError(msg)
-        splits = split_runs(runs, selection.val)
-        for split, stems, run in zip(splits, image_stems(runs), runs, strict=True):
-            for image in images_of(
-                run, selection, recording, stems=stems, left_out=left_out, observe=tell
-            ):
-                counts[split] += 1
-                uncertain += sum(not one.sure for one in image.objects)
-                yield split, run, image
-        if not counts:
-            reasons = ", ".join(f"{reason} ({count}×)" for reason, count in left_out.items())
-            msg = f"no image to export: {reasons or 'no object with a reliable label'}"
-            raise OutputError(msg)
-
     names = different_names([run.name for run in runs])
-    ids = {name: run.info["id"] for name, run in zip(names, runs, strict=True)}
     about = {
         "format": format,
-        "runs": ids,
+        "runs": {name: run.info["id"] for name, run in zip(names, runs, strict=True)},
         "recordings": sorted({run.info["input"]["digest"] for run in runs}),
     }
-    objects = _staged(out, about, lambda hidden: DATASETS[format](hidden, images(), categories))
-    return Exported(objects, uncertain, counts)
+    counts = Exported()
+    images = _labelled_images(runs, selection, counts, recording, observe)
+    objects = _staged(out, about, lambda hidden: DATASETS[format](hidden, images, categories))
+    return replace(counts, objects=objects)
+
+
+def _labelled_images(
+    runs: Sequence[FinishedRun],
+    selection: Selection,
+    counts: Exported,
+    recording: Path | None,
+    observe: Observer,
+) -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
+    """Yield the images of a data set, each with its split and its run, and count them."""
+    total = sum(int(run.info["counts"]["frames"]) for run in runs)
+    done, left_out = itertools.count(1), Counter[str]()
+    splits = split_runs(runs, selection.val)
+    for split, stems, run in zip(splits, image_stems(runs), runs, strict=True):
+        for image in images_of(
+            run,
+            selection,
+            recording,
+            stems=stems,
+            left_out=left_out,
+            observe=lambda *_: observe("export", next(done), total),
+        ):
+            counts.images[split] += 1
+            counts.uncertain += sum(not one.sure for one in image.objects)
+            yield split, run, image
+    if not counts.images:
+        reasons = ", ".join(f"{reason} ({count}×)" for reason, count in left_out.items())
+        msg = f"no image to export: {reasons or 'no object with a reliable label'}"
+        raise OutputError(msg)
 
 
 def common_categories(runs: Sequence[FinishedRun]) -> tuple[str, ...]:
