@@ -179,11 +179,11 @@ def _export_dataset(
     chosen: dict[str, Any],
 ) -> None:
     """Export several runs as one data set."""
-    from shapecat.outputs.exports.dataset_frames import Selection
+    from shapecat.outputs.exports.dataset_frames import ImageSelection
     from shapecat.outputs.exports.formats import export_dataset
 
     with progress_bars() as bars:
-        selection = Selection(**chosen)
+        selection = ImageSelection(**chosen)
         exported = export_dataset(runs, kind, out, selection, recording=recording, observe=bars)
     click.echo(f"{plural(len(runs), 'run')}: {plural(exported.objects, 'labelled view')} in {out}")
     train, val = exported.images["train"], exported.images["val"]

@@ -22,7 +22,7 @@ _THREADS = 16
 """Threads that read complete runs: at a URL, each is a round trip."""
 
 
-class Tally:
+class Outcomes:
     """Counts of the outcomes of a batch, and the complete recordings to print.
 
     It keeps the first 100, or all if ``keep_all``, and every run that received labels from replaced
@@ -53,7 +53,7 @@ class Tally:
         return [by_folder[task.name] for task in tasks if task.name in by_folder]
 
 
-def print_closing(tasks: Sequence["Task"], tally: Tally) -> None:
+def print_closing(tasks: Sequence["Task"], tally: Outcomes) -> None:
     """Print the complete recordings if there are at most 100, transferred labels, and totals."""
     complete = tally.in_order(tasks)
     if 0 < tally.complete <= _MOST_ROWS:

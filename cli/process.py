@@ -18,7 +18,7 @@ from .options import (
     set_option,
     verbose_option,
 )
-from .outcomes import Tally, print_closing, summaries_as_dicts
+from .outcomes import Outcomes, print_closing, summaries_as_dicts
 from .progress import KINDS, Progress, describe_plan, open_progress
 from .render import for_any_reader, print_json
 
@@ -185,7 +185,7 @@ def process(
     )
     with plan_batch(job, recordings, out, shard=shard) as batch:
         display = open_progress(progress, batch.tasks)
-        tally = Tally(keep_all=as_json)
+        tally = Outcomes(keep_all=as_json)
         for outcome in _process(batch, display, jobs, executor, scheduler):
             display.ended(outcome)
             tally.add(outcome)

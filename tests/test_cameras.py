@@ -310,19 +310,19 @@ def test_rays_agree_with_pixels_to_a_thousandth_of_a_pixel() -> None:
 def test_up_is_rotated_from_fixed_frame_into_sensor_frame() -> None:
     """Z of the fixed frame, seen by the sensor, is the last row of fixed_from_sensor."""
     from shapecat.recordings.transforms.buffer import TransformBuffer  # noqa: PLC0415  the same
-    from shapecat.recordings.transforms.gravity import Upright  # noqa: PLC0415  beside its only use
+    from shapecat.recordings.transforms.gravity import PoseFinder  # noqa: PLC0415  used only here
     from shapecat.recordings.transforms.window import TransformWindow  # noqa: PLC0415  the same
 
     turn = Rotation.from_euler("xyz", [-2.1, 0.3, 0.8])
     transforms = TransformBuffer()
     transforms.add("map", "camera", 0, ((1.0, 2.0, 3.0), tuple(turn.as_quat())), static=True)
-    upright = Upright(TransformWindow(transforms), "map", None, ("tf",))
+    poses = PoseFinder(TransformWindow(transforms), "map", None, ("tf",))
     frame = Frame("/depth", 0, 5, 5, "camera", points=np.zeros((1, 3)))
 
-    up = upright.orient(frame).up
+    up = poses.orient(frame).up
     assert up is not None
     assert_allclose(up, turn.inv().apply([0, 0, 1]), atol=1e-6)
-    pose = upright.fixed_from_sensor(frame)
+    pose = poses.fixed_from_sensor(frame)
     assert pose is not None
     assert_allclose(pose.rotation, turn.as_matrix(), atol=1e-9)
     assert_allclose(pose.translation, [1, 2, 3])

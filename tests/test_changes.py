@@ -17,7 +17,7 @@ from shapecat.recordings.colour_streams import pair_colours
 from shapecat.recordings.decoding.decoders import decode
 from shapecat.recordings.messages import Channel, Message
 from shapecat.recordings.transforms.buffer import TransformBuffer
-from shapecat.recordings.transforms.gravity import Upright
+from shapecat.recordings.transforms.gravity import PoseFinder
 from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.reuse import KeyView, find_repeats, view_object
 from shapecat.reuse.agreement import agreement
@@ -141,16 +141,16 @@ def test_missing_pose_or_up_affects_only_its_topic() -> None:
     """One sensor may lack transforms, and planes may contradict the up direction of another."""
     transforms = TransformBuffer()
     transforms.add("map", "head", 0, ((1.0, 2.0, 3.0), STILL), static=True)
-    upright = Upright(TransformWindow(transforms), None, None, ("tf", "imu"))
+    poses = PoseFinder(TransformWindow(transforms), None, None, ("tf", "imu"))
     lost, head, hand = (
         Frame(f"/{name}", 0, 5, 5, frame_id, points=np.zeros((1, 3)))
         for name, frame_id in (("lost", "nowhere"), ("head", "head"), ("hand", "head"))
     )
-    upright.contradict("/hand", "transforms, z of map", [40.0])
+    poses.contradict("/hand", "transforms, z of map", [40.0])
 
-    assert upright.fixed_from_sensor(lost) is None
-    assert upright.fixed_from_sensor(head) is not None
-    ups = [upright.accept(frame.topic, upright.orient(frame)) for frame in (lost, head, hand)]
+    assert poses.fixed_from_sensor(lost) is None
+    assert poses.fixed_from_sensor(head) is not None
+    ups = [poses.accept(frame.topic, poses.orient(frame)) for frame in (lost, head, hand)]
     assert [up is None for up in ups] == [True, False, True]
 
 

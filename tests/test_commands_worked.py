@@ -19,7 +19,7 @@ from shapecat.batch.ledger import Outcome
 from shapecat.executors import WorkerExecutor
 from shapecat.learning import load_model, save_model
 from shapecat.outputs.counts import count_words
-from shapecat.outputs.exports.dataset_frames import Selection
+from shapecat.outputs.exports.dataset_frames import ImageSelection
 from shapecat.outputs.exports.formats import Exported
 from shapecat.runs.jobs import Job, Summary
 from shapecat.runs.labels.transfer import TABLE_ALONE
@@ -113,7 +113,7 @@ def test_workers_save_their_frames_after_a_signal_only(error: Any, ended: str) -
 
 def test_closing_table_follows_order_of_plan(capsys: pytest.CaptureFixture[str]) -> None:
     """Recordings finish in any order; users compare the table with their list."""
-    tally = OUTCOMES.Tally(keep_all=False)
+    tally = OUTCOMES.Outcomes(keep_all=False)
     for name, frames in (("b", 20), ("c", None), ("a", 3)):
         counts = {"frames": frames, "tracks": {"cup": 2}}
         summary = SimpleNamespace(
@@ -130,7 +130,7 @@ def test_closing_table_follows_order_of_plan(capsys: pytest.CaptureFixture[str])
     assert "1.3" in rows[1]
     assert closing == "2 complete, 1 failed, 23 frames"
 
-    tally = OUTCOMES.Tally(keep_all=False)
+    tally = OUTCOMES.Outcomes(keep_all=False)
     tally.failed, tally.frames = 2, 1
     OUTCOMES.print_closing([task("a"), task("b")], tally)
     assert capsys.readouterr().out == "0 complete, 2 failed, 1 frame\n"
@@ -164,7 +164,7 @@ def test_closing_table_lists_a_hundred_recordings_or_none(
 ) -> None:
     """Users would take an incomplete table for a complete one."""
     names = [f"r{k}" for k in range(count)]
-    tally = OUTCOMES.Tally(keep_all=False)
+    tally = OUTCOMES.Outcomes(keep_all=False)
     for name in names:
         summary = SimpleNamespace(
             counts={"frames": 30, "tracks": {}}, seconds=1.0, processed=True,
@@ -183,7 +183,7 @@ def test_lost_labels_are_reported_in_a_batch_of_any_size(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """After the hundredth recording, nobody would learn which labels were not transferred."""
-    tally, names = OUTCOMES.Tally(keep_all=False), [f"r{k}" for k in range(102)]
+    tally, names = OUTCOMES.Outcomes(keep_all=False), [f"r{k}" for k in range(102)]
     for name in names:
         lost: Any = {"transferred": [{}], "not_transferred": []} if name == "r101" else None
         summary = SimpleNamespace(
@@ -438,14 +438,14 @@ CALLS = {
     "export a b --format coco --out o --every 3 --per-track 7 --min-confidence 0.6 "
     "--corrected-only --depth --val 0.4": (
         "shapecat.outputs.exports.formats.export_dataset",
-        [[NAMED["a"], NAMED["b"]], "coco", Path("o"), Selection(3, 7, 0.6, True, True, 0.4)],
+        [[NAMED["a"], NAMED["b"]], "coco", Path("o"), ImageSelection(3, 7, 0.6, True, True, 0.4)],
         {"recording": None},
         Exported(1075, 3, Counter(train=1400, val=20)),
         "2 runs: 1,075 labelled views in o\n1,400 images in train, 20 in val\n",
     ),
     "export a b --format yolo --out o": (
         "shapecat.outputs.exports.formats.export_dataset",
-        [[NAMED["a"], NAMED["b"]], "yolo", Path("o"), Selection()],
+        [[NAMED["a"], NAMED["b"]], "yolo", Path("o"), ImageSelection()],
         {"recording": None},
         Exported(7, 0, Counter(train=1)),
         (

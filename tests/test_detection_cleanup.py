@@ -8,7 +8,7 @@ from shapecat.detection.cleanup.context import add_context, measure_borders
 from shapecat.detection.cleanup.holes import fill_holes
 from shapecat.detection.cleanup.object_features import (
     OBJECT_FEATURES,
-    Limits,
+    ViewLimits,
     _border_lines,
     _measure,
     measure_object_features,
@@ -91,7 +91,7 @@ def test_height_and_noise_of_plane_around_segment_are_measured() -> None:
     local_plane, none = np.zeros((11, 3, 11), np.float32), np.zeros((11, 11), np.uint8)
     graph = SurfaceGraph(local_plane, local_plane, none, none, spans)
     parts = OverSegmentation(graph, labels, segments)
-    _measure(grid, model, parts, Limits(-1, -1, -1, -1, 0.25), features)
+    _measure(grid, model, parts, ViewLimits(-1, -1, -1, -1, 0.25), features)
     rows = features["surroundings"]
     least = 0.004 + 0.0025 * 2.0**2
     assert rows["plane_height"][1] == pytest.approx(0.001 / least)

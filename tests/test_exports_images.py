@@ -19,7 +19,7 @@ from shapecat.colour.image_masks import mask_of
 from shapecat.colour.masks import Mask
 from shapecat.colour.outline import joined, outlines
 from shapecat.errors import OutputError
-from shapecat.outputs.exports.dataset_frames import Selection
+from shapecat.outputs.exports.dataset_frames import ImageSelection
 from shapecat.outputs.exports.formats import export_dataset, export_run
 from shapecat.recordings import MessageError
 from shapecat.recordings.decoding.colour_image import pixels_of
@@ -72,7 +72,7 @@ def decoded(segmentation: dict[str, Any]) -> np.ndarray:
 
 
 def test_coco_has_original_images_and_masks_of_tracks(run: Path, tmp_path: Path) -> None:
-    count = export_dataset([read_finished(run)], "coco", tmp_path / "out", Selection()).objects
+    count = export_dataset([read_finished(run)], "coco", tmp_path / "out", ImageSelection()).objects
 
     data = read_coco(tmp_path / "out")
     names = {c["id"]: c["name"] for c in data["categories"]}
@@ -110,7 +110,7 @@ def nearest(box: list[int], others: Iterable[tuple[int, int, int, int]]) -> int:
 
 def test_exported_masks_follow_colour_edges(coloured_run: Path, tmp_path: Path) -> None:
     """Models learn the outlines of masks, and depth alone is off by a pixel or two."""
-    export_dataset([read_finished(coloured_run)], "coco", tmp_path / "out", Selection())
+    export_dataset([read_finished(coloured_run)], "coco", tmp_path / "out", ImageSelection())
     true = np.load(coloured_run.parents[1] / "table.color_labels.npz")["labels"]
     data = read_coco(tmp_path / "out")
     frames = {image["id"]: image["frame"] for image in data["images"]}
@@ -132,13 +132,17 @@ def test_exported_masks_follow_colour_edges(coloured_run: Path, tmp_path: Path) 
 
 def test_uncertain_labels_are_crowds_but_corrected_ones_are_not(run: Path, tmp_path: Path) -> None:
     """Training must neither learn a wrong label nor take the object for background."""
-    export_dataset([read_finished(run)], "coco", tmp_path / "out", Selection(corrected_only=True))
+    export_dataset(
+        [read_finished(run)], "coco", tmp_path / "out", ImageSelection(corrected_only=True)
+    )
     data = read_coco(tmp_path / "out")
     certain = {row["attributes"]["track"] for row in data["annotations"] if not row["iscrowd"]}
     assert certain == {2}
     assert sum(row["iscrowd"] for row in data["annotations"]) > 5
 
-    export_dataset([read_finished(run)], "coco", tmp_path / "out", Selection(min_confidence=1.0))
+    export_dataset(
+        [read_finished(run)], "coco", tmp_path / "out", ImageSelection(min_confidence=1.0)
+    )
     data = read_coco(tmp_path / "out")
     assert {r["attributes"]["track"] for r in data["annotations"] if not r["iscrowd"]} == {2}
 
@@ -148,7 +152,9 @@ def test_export_warns_about_missing_validation_and_labels(
     run: Path, tmp_path: Path, shapecat: Run, kind: str
 ) -> None:
     """A model without validation images, or one that learns to overlook objects, seems fine."""
-    export_dataset([read_finished(run)], "coco", tmp_path / "all", Selection(corrected_only=True))
+    export_dataset(
+        [read_finished(run)], "coco", tmp_path / "all", ImageSelection(corrected_only=True)
+    )
     data = read_coco(tmp_path / "all")
     crowds = sum(row["iscrowd"] for row in data["annotations"])
     options = ("--format", kind, "--out", tmp_path / "out")
@@ -164,8 +170,8 @@ def test_export_warns_about_missing_validation_and_labels(
 
 def test_yolo_polygons_cover_masks(run: Path, tmp_path: Path) -> None:
     """Classes count from 0 and corners are shares of the image: both are easily mistaken."""
-    export_dataset([read_finished(run)], "yolo", tmp_path / "yolo", Selection())
-    export_dataset([read_finished(run)], "coco", tmp_path / "coco", Selection())
+    export_dataset([read_finished(run)], "yolo", tmp_path / "yolo", ImageSelection())
+    export_dataset([read_finished(run)], "coco", tmp_path / "coco", ImageSelection())
     data = read_coco(tmp_path / "coco")
     names = {c["id"]: c["name"] for c in data["categories"]}
     text = (tmp_path / "yolo/data.yaml").read_text()
@@ -238,7 +244,7 @@ def test_outlines_are_sorted_by_area_and_links_add_none() -> None:
 
 def test_depth_images_are_millimetres_with_their_own_masks(run: Path, tmp_path: Path) -> None:
     """Recordings without colour give data sets too, and depth keeps its 16 bits."""
-    export_dataset([read_finished(run)], "coco", tmp_path / "out", Selection(depth=True))
+    export_dataset([read_finished(run)], "coco", tmp_path / "out", ImageSelection(depth=True))
     data = read_coco(tmp_path / "out")
     source = Path(read_finished(run).info["input"]["path"])
     (first, *_), messages = data["images"], read_ros(source, "/camera/depth/image_raw")
@@ -333,7 +339,10 @@ def test_several_runs_make_one_data_set_split_by_recording(
     info["input"]["digest"] = "xxh3-128:another"
     (other / "run.json").write_text(json.dumps(info))
     found = export_dataset(
-        [read_finished(run), read_finished(other)], "coco", tmp_path / "out", Selection(val=0.5)
+        [read_finished(run), read_finished(other)],
+        "coco",
+        tmp_path / "out",
+        ImageSelection(val=0.5),
     )
 
     both = [read_coco(tmp_path / "out", split) for split in ("train", "val")]
@@ -356,7 +365,7 @@ def test_progress_counts_frames_that_are_left_out(run: Path, tmp_path: Path, for
         events.append(event)
 
     if format_ == "coco":
-        chosen = Selection(depth=True, every=3)
+        chosen = ImageSelection(depth=True, every=3)
         export_dataset([read_finished(run)], format_, tmp_path / "out", chosen, observe=observe)
     else:
         export_run(read_finished(run), format_, tmp_path / "out", every=3, observe=observe)
@@ -371,7 +380,7 @@ def test_runs_with_equal_names_keep_their_images(coloured_run: Path, tmp_path: P
         shutil.copytree(coloured_run, tmp_path / day / "lab 1")
     runs = [tmp_path / day / "lab 1" for day in ("monday", "tuesday")]
     export_dataset(
-        [read_finished(one) for one in runs], "coco", tmp_path / "out", Selection(val=0.0)
+        [read_finished(one) for one in runs], "coco", tmp_path / "out", ImageSelection(val=0.0)
     )
 
     images = read_coco(tmp_path / "out")["images"]
@@ -383,13 +392,13 @@ def test_runs_with_equal_names_keep_their_images(coloured_run: Path, tmp_path: P
 
 
 def test_frames_are_selected_by_interval_and_by_track(run: Path, tmp_path: Path) -> None:
-    export_dataset([read_finished(run)], "coco", tmp_path / "every", Selection(every=2))
+    export_dataset([read_finished(run)], "coco", tmp_path / "every", ImageSelection(every=2))
     assert [i["frame"] for i in read_coco(tmp_path / "every")["images"]] == [0, 2]
     export_dataset(
         [read_finished(run)],
         "coco",
         tmp_path / "track",
-        Selection(per_track=1, corrected_only=True),
+        ImageSelection(per_track=1, corrected_only=True),
     )
     (image,) = read_coco(tmp_path / "track")["images"]
     pixels = {
@@ -411,7 +420,7 @@ def test_images_with_equal_stamps_are_all_exported(coloured_run: Path, tmp_path:
     masks = masks.set_column(at, masks.schema.field(at), pa.array(stamps, pa.int64()))
     pq.write_table(masks, folder / "masks.parquet")
 
-    export_dataset([read_finished(folder)], "coco", tmp_path / "out", Selection())
+    export_dataset([read_finished(folder)], "coco", tmp_path / "out", ImageSelection())
 
     assert [i["frame"] for i in read_coco(tmp_path / "out")["images"]] == list(range(2 * half))
 
@@ -435,7 +444,7 @@ def test_no_frames_are_kept_for_views_that_are_not_labelled(
         [read_finished(folder)],
         "coco",
         tmp_path / "out",
-        Selection(per_track=1, corrected_only=True),
+        ImageSelection(per_track=1, corrected_only=True),
     )
 
     assert [i["frame"] for i in read_coco(tmp_path / "out")["images"]] == [best[named][1]]
@@ -457,13 +466,13 @@ def test_current_folder_is_not_replaced(shapecat: Run, run: Path, tmp_path: Path
 
 def test_only_earlier_export_is_replaced(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    export_dataset([read_finished(run)], "coco", out, Selection())
-    export_dataset([read_finished(run)], "coco", out, Selection(every=2))
+    export_dataset([read_finished(run)], "coco", out, ImageSelection())
+    export_dataset([read_finished(run)], "coco", out, ImageSelection(every=2))
     assert len(read_coco(out)["images"]) == 2
     with pytest.raises(OutputError, match="holds coco, not an earlier yolo export"):
-        export_dataset([read_finished(run)], "yolo", out, Selection())
+        export_dataset([read_finished(run)], "yolo", out, ImageSelection())
     with pytest.raises(OutputError, match="holds something else"):
-        export_dataset([read_finished(run)], "coco", run, Selection())
+        export_dataset([read_finished(run)], "coco", run, ImageSelection())
 
 
 @pytest.mark.parametrize(
@@ -538,5 +547,5 @@ def test_damaged_image_is_skipped(run: Path, tmp_path: Path, monkeypatch: Any) -
         return read(image)
 
     monkeypatch.setattr(dataset_frames, "pixels_of", failing)
-    export_dataset([read_finished(run)], "coco", tmp_path / "out", Selection())
+    export_dataset([read_finished(run)], "coco", tmp_path / "out", ImageSelection())
     assert [i["frame"] for i in read_coco(tmp_path / "out")["images"]] == [0, 2, 3]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-from shapecat.outputs.exports.dataset_frames import Selection
+from shapecat.outputs.exports.dataset_frames import ImageSelection
 from shapecat.outputs.exports.formats import export_dataset
 from shapecat.runs.finished import read_finished
 from tests.test_exports import relabel
@@ -41,7 +41,7 @@ def runs(coloured_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def coco(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a data set with certain and uncertain labels."""
     out = tmp_path_factory.mktemp("readback") / "coco"
-    export_dataset([read_finished(runs / "lab0")], "coco", out, Selection(corrected_only=True))
+    export_dataset([read_finished(runs / "lab0")], "coco", out, ImageSelection(corrected_only=True))
     return out
 
 
@@ -104,8 +104,8 @@ def test_supervision_reads_coco(coco: Path, supervision: Any) -> None:
 
 def test_supervision_reads_yolo(runs: Path, tmp_path: Path, supervision: Any) -> None:
     """YOLO polygons cover the COCO masks of the same objects."""
-    export_dataset([read_finished(runs / "lab0")], "yolo", tmp_path / "yolo", Selection())
-    export_dataset([read_finished(runs / "lab0")], "coco", tmp_path / "coco", Selection())
+    export_dataset([read_finished(runs / "lab0")], "yolo", tmp_path / "yolo", ImageSelection())
+    export_dataset([read_finished(runs / "lab0")], "coco", tmp_path / "coco", ImageSelection())
     data = read_coco(tmp_path / "coco")
     names = {row["id"]: row["name"] for row in data["categories"]}
     read = supervision.DetectionDataset.from_yolo(

@@ -19,7 +19,7 @@ from shapecat.errors import NoStreamError, RecordingError
 from shapecat.geometry import IDENTITY
 from shapecat.recordings import choose_streams, frames, open_recording
 from shapecat.recordings.containers.ros1_bag import BagRecording
-from shapecat.recordings.transforms.gravity import Upright
+from shapecat.recordings.transforms.gravity import PoseFinder
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Camera
 from tests.messages import EPOCH, SECOND, write
@@ -86,10 +86,10 @@ def read(path: Path) -> Outcome:
     try:
         with open_recording(path) as recording:
             streams = choose_streams(recording)
-            upright = Upright.of(recording, up="auto", fixed_frame=None)
+            poses = PoseFinder.of(recording, up="auto", fixed_frame=None)
             stamps = []
             for frame in frames(recording, streams, skipped=skipped):
-                upright.accept(frame.topic, upright.orient(frame))
+                poses.accept(frame.topic, poses.orient(frame))
                 stamps.append(frame.stamp_ns)
             messages = " ".join([*recording.warnings, *skipped])
             return Outcome(0 if stamps else 4, frozenset(stamps), len(stamps), messages)

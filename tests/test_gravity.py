@@ -20,7 +20,7 @@ from shapecat.recordings import open_recording
 from shapecat.recordings.decoding.pointcloud2 import cloud_points
 from shapecat.recordings.streams import Stream
 from shapecat.recordings.transforms.buffer import TransformBuffer
-from shapecat.recordings.transforms.gravity import Orientation, Upright
+from shapecat.recordings.transforms.gravity import Orientation, PoseFinder
 from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
@@ -65,9 +65,9 @@ def test_imu_up_is_smoothed_and_rotated_into_sensor_frame(tmp_path: Path) -> Non
         items.append(("/gyro", stamp, imu(stamp, [0, 0, 0])))
         items.append(("/fake", stamp, imu(stamp, [9, 9, 9], absent=True)))
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        upright = Upright.of(recording, up="imu", fixed_frame=None)
-        up = upright.orient(frame(EPOCH + SECOND)).up
-        late = upright.orient(frame(EPOCH + 60 * SECOND)).up
+        poses = PoseFinder.of(recording, up="imu", fixed_frame=None)
+        up = poses.orient(frame(EPOCH + SECOND)).up
+        late = poses.orient(frame(EPOCH + 60 * SECOND)).up
 
     assert up is not None
     assert np.degrees(np.arccos(up @ (TURN.T @ [0, 0, 1]))) < 3
@@ -81,8 +81,8 @@ def test_imu_without_stamps_uses_log_times(tmp_path: Path) -> None:
         for k, a in ((0, [0, -9.8, 0]), (7, [9.8, 0, 0]))
     ]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        upright = Upright.of(recording, up="imu", fixed_frame=None)
-        found = [upright.orient(frame(EPOCH + k * SECOND)).up for k in (0, 3, 7)]
+        poses = PoseFinder.of(recording, up="imu", fixed_frame=None)
+        found = [poses.orient(frame(EPOCH + k * SECOND)).up for k in (0, 3, 7)]
 
     assert [None if up is None else up.tolist() for up in found] == [[0, -1, 0], None, [1, 0, 0]]
 
@@ -94,7 +94,7 @@ def test_missing_stamps_of_an_imu_are_in_the_clock_of_the_others(tmp_path: Path)
         for stamp, a in ((0, [0, -9.8, 0]), (7 * SECOND, [9.8, 0, 0]))
     ]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        up = Upright.of(recording, up="imu", fixed_frame=None).orient(frame(0)).up
+        up = PoseFinder.of(recording, up="imu", fixed_frame=None).orient(frame(0)).up
 
     assert up is not None
     assert up.tolist() == [0, -1, 0]
@@ -104,7 +104,7 @@ def test_imu_in_the_sensor_frame_needs_no_transform_whatever_the_slash(tmp_path:
     """Some ROS 1 drivers write ``/camera``, others ``camera``: the accelerations were lost."""
     items = [("/imu", EPOCH, imu(EPOCH, [0, -9.8, 0], "/camera"))]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        up = Upright.of(recording, up="imu", fixed_frame=None).orient(frame(EPOCH)).up
+        up = PoseFinder.of(recording, up="imu", fixed_frame=None).orient(frame(EPOCH)).up
 
     assert up is not None
     assert up.tolist() == [0, -1, 0]
@@ -117,8 +117,8 @@ def test_imu_logged_late_uses_its_stamps(tmp_path: Path) -> None:
         for k, a in ((1, [0, -9.8, 0]), (8, [9.8, 0, 0]))
     ]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        upright = Upright.of(recording, up="imu", fixed_frame=None)
-        found = [upright.orient(frame(EPOCH + k * SECOND)).up for k in (1, 8, 15)]
+        poses = PoseFinder.of(recording, up="imu", fixed_frame=None)
+        found = [poses.orient(frame(EPOCH + k * SECOND)).up for k in (1, 8, 15)]
 
     assert [None if up is None else up.tolist() for up in found] == [[0, -1, 0], [1, 0, 0], None]
 
@@ -127,7 +127,7 @@ def test_imu_logged_late_uses_its_stamps(tmp_path: Path) -> None:
 def test_missing_up_source_is_an_error(tmp_path: Path, up: str, error: str) -> None:
     path = write(tmp_path / "a.mcap", [("/x", 1, make("std_msgs/msg/String", "x"))])
     with open_recording(path) as recording, pytest.raises(ConfigError, match=error):
-        Upright.of(recording, up=up, fixed_frame=None)
+        PoseFinder.of(recording, up=up, fixed_frame=None)
 
 
 @pytest.mark.parametrize(("tilt_deg", "warns"), [(0.0, False), (13.0, True), (50.0, True)])
@@ -174,7 +174,7 @@ def test_given_up_is_dropped_only_if_no_plane_confirms_it(
     monkeypatch: pytest.MonkeyPatch, off_deg: tuple[float | None, ...], *, dropped: bool
 ) -> None:
     """A cupboard in view at the start must not override a correct up direction."""
-    upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
+    poses = PoseFinder(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
     given = Orientation("tf", np.array([0.0, -1.0, 0.0]), None)
     angles = [None if off is None else np.radians(off) for off in off_deg]
     found = [None if a is None else np.array([0, -np.cos(a), -np.sin(a)]) for a in angles]
@@ -183,10 +183,10 @@ def test_given_up_is_dropped_only_if_no_plane_confirms_it(
     frames = [frame(EPOCH + k) for k in range(len(off_deg))]
 
     oriented = ((item, None, given) for item in frames)
-    returned = list(up_check.UpCheck(upright, Settings()).before(oriented))
+    returned = list(up_check.UpCheck(poses, Settings()).before(oriented))
 
     assert [item for item, *_ in returned] == frames
-    assert upright.dropped == ({"/d": "tf"} if dropped else {})
+    assert poses.dropped == ({"/d": "tf"} if dropped else {})
 
 
 @pytest.mark.parametrize(("up", "most"), [(None, 1), (np.array([0.0, -1.0, 0.0]), 65)])
@@ -195,7 +195,7 @@ def test_topic_that_ends_early_does_not_hold_frames_back(
 ) -> None:
     """All other frames of a long recording would be kept in memory, and nothing be saved."""
     monkeypatch.setattr(up_check, "find_up", lambda *_: None)
-    upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
+    poses = PoseFinder(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
     frames = [frame(EPOCH + k) for k in range(300)]
     frames[1] = replace(frames[1], topic="/short")
     held: set[int] = set()
@@ -206,23 +206,23 @@ def test_topic_that_ends_early_does_not_hold_frames_back(
             assert len(held) <= most
             yield item, None, Orientation("tf" if up is not None else "", up, None)
 
-    for item, *_ in up_check.UpCheck(upright, Settings()).before(read()):
+    for item, *_ in up_check.UpCheck(poses, Settings()).before(read()):
         held.remove(item.stamp_ns)
     assert not held
 
 
 def test_up_that_is_given_later_is_tested(monkeypatch: pytest.MonkeyPatch) -> None:
     """Transforms often begin after the first frames, which must not decide for the others."""
-    upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
+    poses = PoseFinder(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
     given, plane = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0])
     monkeypatch.setattr(up_check, "find_up", lambda *_: plane)
     ups = [Orientation("", None, None)] * 4 + [Orientation("tf", given, None)] * 4
     oriented = ((frame(EPOCH + k), None, up) for k, up in enumerate(ups))
 
-    returned = list(up_check.UpCheck(upright, Settings()).before(oriented))
+    returned = list(up_check.UpCheck(poses, Settings()).before(oriented))
 
     assert [item.stamp_ns - EPOCH for item, *_ in returned] == list(range(8))
-    assert upright.dropped == {"/d": "tf"}
+    assert poses.dropped == {"/d": "tf"}
 
 
 @pytest.mark.parametrize("clouds", [False, True])
@@ -256,16 +256,16 @@ def test_map_with_z_forward_does_not_correct_transforms(
 ) -> None:
     """Visual SLAM names the first pose of its camera the map: tracks drifted as it moved."""
     pitch = np.radians(pitch_deg)
-    upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
+    poses = PoseFinder(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
     planes = np.array([0.0, -np.cos(pitch), -np.sin(pitch)])
     monkeypatch.setattr(up_check, "find_up", lambda *_: planes)
     given = Orientation("transforms, z of map", np.array([0.0, 0.0, 1.0]), None)
     oriented = ((frame(EPOCH + k), None, given) for k in range(4))
 
-    list(up_check.UpCheck(upright, Settings()).before(oriented))
+    list(up_check.UpCheck(poses, Settings()).before(oriented))
 
-    assert bool(upright.misnamed) is corrected
-    assert bool(upright.dropped) is not corrected
+    assert bool(poses.misnamed) is corrected
+    assert bool(poses.dropped) is not corrected
 
 
 @pytest.mark.parametrize(
@@ -323,7 +323,7 @@ def test_imu_up_is_rotated_into_sensor_of_transformed_cloud(tmp_path: Path) -> N
         frame(EPOCH), frame_id="base", frame_from_sensor=Pose(turn, np.array([0.1, 0.3, 1.2]))
     )
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        up = Upright.of(recording, up="imu", fixed_frame=None).orient(seen).up
+        up = PoseFinder.of(recording, up="imu", fixed_frame=None).orient(seen).up
 
     assert up is not None
     np.testing.assert_allclose(
@@ -337,7 +337,7 @@ def test_imu_is_used_if_transforms_lack_the_sensor(tmp_path: Path) -> None:
         ("/imu", EPOCH, imu(EPOCH, [0, -9.8, 0], "camera")),
     ]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        up = Upright.of(recording, up="auto", fixed_frame=None).orient(frame(EPOCH)).up
+        up = PoseFinder.of(recording, up="auto", fixed_frame=None).orient(frame(EPOCH)).up
 
     assert up is not None
     np.testing.assert_allclose(up, [0, -1, 0], atol=1e-6)
@@ -353,14 +353,14 @@ def test_frames_of_a_robot_may_have_its_name_in_front(tmp_path: Path) -> None:
     """With several robots, r1/map is the map of one of them; each has its own up direction."""
     links = ("r1/map", "r1/camera"), ("r2/map", "r2/base"), ("r2/base", "r2/camera")
     with open_recording(in_frames(tmp_path / "a.mcap", *links)) as recording:
-        upright = Upright.of(recording, up="tf", fixed_frame=None)
-        found = [upright.orient(replace(frame(EPOCH), frame_id=f"/r{k}/camera")) for k in (1, 2)]
+        poses = PoseFinder.of(recording, up="tf", fixed_frame=None)
+        found = [poses.orient(replace(frame(EPOCH), frame_id=f"/r{k}/camera")) for k in (1, 2)]
 
     assert [one.source for one in found] == [f"transforms, z of r{k}/map" for k in (1, 2)]
     assert found[1].up is not None
     np.testing.assert_allclose(found[1].up, (TURN @ TURN)[2])
-    assert upright.fixed_frame == "r1/map"
-    assert upright.failed == 1  # the second robot is not in the map of the first
+    assert poses.fixed_frame == "r1/map"
+    assert poses.failed == 1  # the second robot is not in the map of the first
 
 
 @pytest.mark.parametrize("robot", ["r1", "r10"])
@@ -369,8 +369,8 @@ def test_up_is_that_of_the_robot_of_the_sensor(tmp_path: Path, robot: str) -> No
     links = [("hall", f"{name}/map") for name in ("r1", "r10")]
     links += [(f"{name}/map", f"{name}/camera") for name in ("r1", "r10")]
     with open_recording(in_frames(tmp_path / "a.mcap", *links)) as recording:
-        upright = Upright.of(recording, up="tf", fixed_frame=None)
-        found = upright.orient(replace(frame(EPOCH), frame_id=f"{robot}/camera"))
+        poses = PoseFinder.of(recording, up="tf", fixed_frame=None)
+        found = poses.orient(replace(frame(EPOCH), frame_id=f"{robot}/camera"))
 
     assert found.source == f"transforms, z of {robot}/map"
 
@@ -379,8 +379,8 @@ def test_map_of_all_robots_comes_before_that_of_one(tmp_path: Path) -> None:
     """Where robots share a map, each has the same up direction as the others."""
     links = ("map", "r1/map"), ("r1/map", "r1/camera")
     with open_recording(in_frames(tmp_path / "a.mcap", *links)) as recording:
-        upright = Upright.of(recording, up="tf", fixed_frame=None)
-        found = upright.orient(replace(frame(EPOCH), frame_id="r1/camera"))
+        poses = PoseFinder.of(recording, up="tf", fixed_frame=None)
+        found = poses.orient(replace(frame(EPOCH), frame_id="r1/camera"))
 
     assert found.source == "transforms, z of map"
     assert found.up is not None
@@ -390,10 +390,10 @@ def test_map_of_all_robots_comes_before_that_of_one(tmp_path: Path) -> None:
 def test_wanted_fixed_frame_may_begin_with_a_slash(tmp_path: Path) -> None:
     """ROS 1 wrote frame ids so, and the transforms are stored without it."""
     with open_recording(in_frames(tmp_path / "a.mcap", ("/map", "/camera"))) as recording:
-        upright = Upright.of(recording, up="tf", fixed_frame="/map")
+        poses = PoseFinder.of(recording, up="tf", fixed_frame="/map")
 
-        assert upright.orient(frame(EPOCH)).fixed_from_sensor is not None
-        assert upright.fixed_frame == "map"
+        assert poses.orient(frame(EPOCH)).fixed_from_sensor is not None
+        assert poses.fixed_frame == "map"
 
 
 def test_fixed_frame_is_chosen_for_all_sensors(tmp_path: Path) -> None:
@@ -403,9 +403,9 @@ def test_fixed_frame_is_chosen_for_all_sensors(tmp_path: Path) -> None:
     with open_recording(in_frames(tmp_path / "a.mcap", *links)) as recording:
         chosen = []
         for order in (streams, streams[::-1], streams[:1]):
-            upright = Upright.of(recording, up="tf", fixed_frame=None, streams=order)
-            upright.orient(replace(frame(EPOCH), frame_id="tripod"))
-            chosen.append(upright.fixed_frame)
+            poses = PoseFinder.of(recording, up="tf", fixed_frame=None, streams=order)
+            poses.orient(replace(frame(EPOCH), frame_id="tripod"))
+            chosen.append(poses.fixed_frame)
 
     assert chosen == ["map", "map", "mount"]
 
@@ -422,10 +422,10 @@ def test_map_that_is_known_too_late_is_not_the_fixed_frame(
         stamp = EPOCH + k * period * SECOND
         items.append(("/tf", stamp, MAKE.transforms(links, stamp)))
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        upright = Upright.of(recording, up="auto", fixed_frame=None)
-        upright.orient(frame(EPOCH))
+        poses = PoseFinder.of(recording, up="auto", fixed_frame=None)
+        poses.orient(frame(EPOCH))
 
-    assert upright.fixed_frame == chosen
+    assert poses.fixed_frame == chosen
 
 
 def test_fixed_frame_is_chosen_by_stamps_of_another_clock(tmp_path: Path) -> None:
@@ -435,21 +435,21 @@ def test_fixed_frame_is_chosen_by_stamps_of_another_clock(tmp_path: Path) -> Non
         links = [("odom", "camera", IDENTITY)] + [("map", "odom", IDENTITY)] * (k >= 6)
         items.append(("/tf", EPOCH + k * SECOND, MAKE.transforms(links, (3 + k) * SECOND)))
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        upright = Upright.of(recording, up="auto", fixed_frame=None)
-        upright.orient(replace(frame(EPOCH), stamp_ns=3 * SECOND))
+        poses = PoseFinder.of(recording, up="auto", fixed_frame=None)
+        poses.orient(replace(frame(EPOCH), stamp_ns=3 * SECOND))
 
-    assert upright.fixed_frame == "odom"
+    assert poses.fixed_frame == "odom"
 
 
 def test_loop_of_other_frames_is_reported_and_ignored(tmp_path: Path) -> None:
     """Two drivers that name each other's frames must not cost the whole run its fixed frame."""
     links = ("map", "camera"), ("u", "v"), ("v", "u")
     with open_recording(in_frames(tmp_path / "a.mcap", *links)) as recording:
-        upright = Upright.of(recording, up="tf", fixed_frame=None)
+        poses = PoseFinder.of(recording, up="tf", fixed_frame=None)
 
-        assert upright.orient(frame(EPOCH)).fixed_from_sensor is not None
-        assert upright.fixed_frame == "map"
-    (warning,) = upright.warnings
+        assert poses.orient(frame(EPOCH)).fixed_from_sensor is not None
+        assert poses.fixed_frame == "map"
+    (warning,) = poses.warnings
     assert warning.startswith("transforms: the frames u < v < u form a loop")
 
 
@@ -474,7 +474,7 @@ def test_static_transforms_that_differ_are_reported(
         for k, (parent, x) in enumerate((("base", 0.3), ("base", 0.3), second))
     ]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        warnings = Upright.of(recording, up="auto", fixed_frame=None).warnings
+        warnings = PoseFinder.of(recording, up="auto", fixed_frame=None).warnings
 
     text = "transforms: static ones of camera differ: the last is used for the whole recording"
     assert warnings == [text] * warned
@@ -507,26 +507,24 @@ def test_transforms_with_the_stamps_of_others_are_reported(
         for k, (stamp, x) in enumerate(times)
     ]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        upright = Upright.of(recording, up="auto", fixed_frame=None)
+        poses = PoseFinder.of(recording, up="auto", fixed_frame=None)
         for k in range(len(items)):
-            upright.orient(replace(frame(EPOCH + times[k][0]), log_time_ns=EPOCH + k * SECOND))
-    report_up(upright, tmp_path)
+            poses.orient(replace(frame(EPOCH + times[k][0]), log_time_ns=EPOCH + k * SECOND))
+    report_up(poses, tmp_path)
 
-    found = [
-        text for text in upright.warnings if "a clock was set back, and those of camera" in text
-    ]
+    found = [text for text in poses.warnings if "a clock was set back, and those of camera" in text]
     assert len(found) == warned
 
 
 def test_failed_transform_look_ups_are_counted(tmp_path: Path) -> None:
     items = [("/tf", EPOCH, MAKE.transforms([("map", "elsewhere", IDENTITY)], EPOCH))]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        upright = Upright.of(recording, up="auto", fixed_frame=None)
+        poses = PoseFinder.of(recording, up="auto", fixed_frame=None)
     for stamp in (EPOCH, EPOCH + 1):
-        assert upright.orient(frame(stamp)).up is None
-    report_up(upright, tmp_path)
+        assert poses.orient(frame(stamp)).up is None
+    report_up(poses, tmp_path)
 
-    (warning,) = upright.warnings
+    (warning,) = poses.warnings
     assert warning.startswith("failed transform look-ups: 2, the first: ")
 
 
@@ -546,12 +544,12 @@ def test_frames_without_pose_are_reported_with_what_they_cost(
     for row in rows[begins:]:
         row["fixed_translation"] = [0.0, 0.0, 1.0]
     pq.write_table(pa.Table.from_pylist(rows, FRAMES), tmp_path / "frames.parquet")
-    upright = Upright(TransformWindow(TransformBuffer()), "map", None, ("tf",))
-    upright.failed = begins
+    poses = PoseFinder(TransformWindow(TransformBuffer()), "map", None, ("tf",))
+    poses.failed = begins
 
-    report_up(upright, tmp_path)
+    report_up(poses, tmp_path)
 
-    assert upright.warnings[1:] == [f"/d: the pose of its sensor in map is {loss}"]
+    assert poses.warnings[1:] == [f"/d: the pose of its sensor in map is {loss}"]
 
 
 @pytest.mark.parametrize(
@@ -602,10 +600,10 @@ def test_frame_with_objects_does_not_count_as_without_plane(tmp_path: Path) -> N
             given = None if (row["topic"], row["frame"]) == ("/d", 3) else [0.0, -1.0, 0.0]
             row |= {"up": [0.0, -np.cos(0.1), np.sin(0.1)], "up_given": given}
         pq.write_table(pa.Table.from_pylist(rows, schema), tmp_path / f"{name}.parquet")
-    upright = Upright(TransformWindow(TransformBuffer()), None, None, ("tf",))
-    upright.given = {"transforms, z of map": 3, "planes": 1}
+    poses = PoseFinder(TransformWindow(TransformBuffer()), None, None, ("tf",))
+    poses.given = {"transforms, z of map": 3, "planes": 1}
 
-    report = report_up(upright, tmp_path)
+    report = report_up(poses, tmp_path)
     assert (report["planes_differ_deg"], report["frames_without_plane"]) == (5.7, 3)
 
 
@@ -619,7 +617,7 @@ def test_unknown_fixed_frame_is_an_error_that_lists_the_known_ones(
     """A misspelled name would leave all objects without a track in the room."""
     path = in_frames(tmp_path / "a.mcap", *links)
     with open_recording(path) as recording, pytest.raises(ConfigError) as error:
-        Upright.of(recording, up="auto", fixed_frame="/mpa")
+        PoseFinder.of(recording, up="auto", fixed_frame="/mpa")
 
     assert str(error.value) == f"--fixed-frame /mpa: not in {path}; its frames: {listed}"
 
@@ -631,7 +629,7 @@ def test_malformed_up_is_an_error(tmp_path: Path, up: str) -> None:
         open_recording(in_frames(tmp_path / "a.mcap", ("map", "camera"))) as recording,
         pytest.raises(ConfigError, match=f"--up {up}: expected auto, tf, imu, or a vector"),
     ):
-        Upright.of(recording, up=up, fixed_frame=None)
+        PoseFinder.of(recording, up=up, fixed_frame=None)
 
 
 def test_damaged_imu_message_is_skipped_and_reported(tmp_path: Path) -> None:
@@ -644,7 +642,7 @@ def test_damaged_imu_message_is_skipped_and_reported(tmp_path: Path) -> None:
         ("/imu", EPOCH + 3, imu(EPOCH + 3, (0, np.nan, 0), "camera")),
     ]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
-        found = Upright.of(recording, up="imu", fixed_frame=None).orient(frame(EPOCH))
+        found = PoseFinder.of(recording, up="imu", fixed_frame=None).orient(frame(EPOCH))
         warnings = recording.warnings
 
     assert found.up is not None
@@ -679,7 +677,7 @@ def test_absurd_imu_message_is_skipped_and_reported(tmp_path: Path, changes: Any
             writer.add_message(channel, EPOCH + k, json.dumps(content).encode(), EPOCH + k)
 
     with open_recording(path) as recording:
-        found = Upright.of(recording, up="imu", fixed_frame=None).orient(frame(EPOCH))
+        found = PoseFinder.of(recording, up="imu", fixed_frame=None).orient(frame(EPOCH))
 
         assert recording.warnings == [
             "skipped an IMU message: /imu: message does not match its type"

@@ -15,7 +15,7 @@ from shapecat.errors import ConfigError
 from shapecat.recordings import Message, Recording, open_recording, read_transforms
 from shapecat.recordings.look_ahead import AROUND_NS
 from shapecat.recordings.transforms.buffer import TransformError, fixed_frame
-from shapecat.recordings.transforms.gravity import Upright
+from shapecat.recordings.transforms.gravity import PoseFinder
 from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Frame, Pose
@@ -187,20 +187,20 @@ def test_imu_is_read_only_as_far_as_frames_need(
     items.append(("/begin", EPOCH, ros.make("std_msgs/msg/String", "")))
     path = ros.write(tmp_path / "a.mcap", sorted(items, key=lambda item: item[1]), chunk_size=600)
     with open_recording(path) as recording:
-        upright = Upright.of(recording, up="auto", fixed_frame=None)
+        poses = PoseFinder.of(recording, up="auto", fixed_frame=None)
         assert decoded["/imu"] == 0  # not before a frame needs it
         for second in range(SECONDS):
-            up = upright.orient(frame(second)).up
+            up = poses.orient(frame(second)).up
             assert decoded["/imu"] <= second + 2 * AROUND_NS // SECOND + 2
             if second >= first:
                 assert up is not None
                 assert np.allclose(up, ups[second], atol=1e-6)
             else:
                 assert up is None
-        assert upright.accelerometers is not None
-        (accelerometer,) = upright.accelerometers.around(*2 * [EPOCH + (SECONDS - 1) * SECOND])
+        assert poses.accelerometers is not None
+        (accelerometer,) = poses.accelerometers.around(*2 * [EPOCH + (SECONDS - 1) * SECOND])
         assert len(accelerometer._sums) < SECONDS // 2
-        assert Upright.of(recording, up="imu", fixed_frame=None).orient(frame(60)).up is not None
+        assert PoseFinder.of(recording, up="imu", fixed_frame=None).orient(frame(60)).up is not None
 
 
 def test_imu_without_accelerations_is_refused(tmp_path: Path) -> None:
@@ -212,4 +212,4 @@ def test_imu_without_accelerations_is_refused(tmp_path: Path) -> None:
         open_recording(ros.write(tmp_path / "a.mcap", items)) as recording,
         pytest.raises(ConfigError, match="no sensor_msgs/Imu with accelerations"),
     ):
-        Upright.of(recording, up="imu", fixed_frame=None)
+        PoseFinder.of(recording, up="imu", fixed_frame=None)

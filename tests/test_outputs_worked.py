@@ -33,7 +33,7 @@ from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.exports.coco import DATASETS
 from shapecat.outputs.exports.dataset_frames import (
-    Selection,
+    ImageSelection,
     _chosen,
     _colour_file,
     _depth_file,
@@ -503,7 +503,7 @@ def test_frames_are_thinned_per_topic() -> None:
     frames = [labelled_frame(k, topic=topic) for k, topic in enumerate(topics)]
 
     assert [f.index for f in thinned(frames, 2)] == [0, 1, 3, 6]
-    chosen = _chosen(finished(frames), Selection(every=2), set())
+    chosen = _chosen(finished(frames), ImageSelection(every=2), set())
     assert chosen == {("/a", 0), ("/b", 1), ("/a", 3), ("/b", 6)}
 
 
@@ -515,9 +515,9 @@ def test_image_is_in_a_data_set_once(per_track: int) -> None:
     views = (labelled_frame(k, labelled_object(1, range(9 + k))) for k in range(len(images)))
     frames = [replace(view, masks=one) for view, one in zip(views, masks, strict=True)]
 
-    chosen = _chosen(finished(frames), Selection(per_track=per_track), set())
+    chosen = _chosen(finished(frames), ImageSelection(per_track=per_track), set())
     assert chosen == {("/depth", k) for k in (1, 2, 3, 4)}
-    depth = Selection(per_track=per_track, depth=True)
+    depth = ImageSelection(per_track=per_track, depth=True)
     assert _chosen(finished(frames), depth, set()) == {("/depth", k) for k in range(5)}
 
 
@@ -532,14 +532,14 @@ def test_most_different_views_of_track_are_selected() -> None:
         labelled_frame(k, labelled_object(1, range(pixels), box=box_at((x, 0, 1), (1, 1, 1))))
         for k, (pixels, x) in enumerate([(30, 0.0), (99, 0.1), (30, 2.0), (30, 0.2)])
     ]
-    chosen = _chosen(finished(frames), Selection(per_track=2), set())
+    chosen = _chosen(finished(frames), ImageSelection(per_track=2), set())
     assert chosen == {("/depth", 1), ("/depth", 2)}
-    above = Selection(per_track=2, min_confidence=0.61)
+    above = ImageSelection(per_track=2, min_confidence=0.61)
     assert _chosen(finished(frames), above, set()) == set()
     assert _chosen(finished(frames), above, {1}) == chosen
-    exact = Selection(per_track=2, min_confidence=0.6)
+    exact = ImageSelection(per_track=2, min_confidence=0.6)
     assert _chosen(finished(frames), exact, set()) == chosen
-    corrected = Selection(per_track=2, corrected_only=True)
+    corrected = ImageSelection(per_track=2, corrected_only=True)
     assert _chosen(finished(frames), corrected, set()) == set()
 
 
@@ -587,7 +587,7 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
 
     left_out = Counter[str]()
     stems = dict.fromkeys(sensors, "lab")
-    found = images_of(finished, Selection(), stems=stems, left_out=left_out)
+    found = images_of(finished, ImageSelection(), stems=stems, left_out=left_out)
 
     assert list(found) == [images[1], images[4]]
     assert left_out == {"no image": 1, "no object with a reliable label": 2}
@@ -697,11 +697,11 @@ def test_data_set_of_several_recordings_is_not_replaced_by_one_of_them(
     monkeypatch.setitem(DATASETS, "coco", lambda *_: 3)
     a, b, c = (read(tmp_path / name) for name in "abc")
     out = tmp_path / "out"
-    export_dataset([b, a], "coco", out, Selection())
+    export_dataset([b, a], "coco", out, ImageSelection())
     for alone in (a, b):
         with pytest.raises(OutputError, match=r"of another recording; .* export all runs together"):
-            export_dataset([alone], "coco", out, Selection())
-    export_dataset([c, b, a], "coco", out, Selection())
+            export_dataset([alone], "coco", out, ImageSelection())
+    export_dataset([c, b, a], "coco", out, ImageSelection())
 
     assert json.loads((out / "export.json").read_text()) == {
         "format": "coco",

@@ -20,7 +20,7 @@ from shapecat.colour.masks import Mask
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.png import png
 from shapecat.outputs.report import choosing
-from shapecat.outputs.report.cards import Card, Tally, _few, card_html
+from shapecat.outputs.report.cards import Card, TrackCounts, _few, card_html
 from shapecat.outputs.report.choosing import Choice, _areas, choose_frames
 from shapecat.outputs.report.images import Crop, FramePicture, _border_share, _hidden_share, encode
 from shapecat.outputs.report.page import Listed, _strip, index_page, run_page
@@ -283,7 +283,7 @@ def test_index_sums_its_runs() -> None:
     for k, (frames, unsure, checked) in enumerate([(7, 2, 5), (40, 1, 0)]):
         counts = Counter({"cup": 3 + k, "can": 6})
         info = {"counts": {"frames": frames}, "seconds": {"total": 12.34}}
-        tally = Tally(counts, unsure, checked)
+        tally = TrackCounts(counts, unsure, checked)
         listed.append(Listed(f"{k}.html", f"run {k}", info, tally, k, ("data:p",)))
     text = index_page("runs", listed)
 
@@ -302,7 +302,9 @@ def test_index_orders_categories_of_equal_counts() -> None:
     """Labels come from a set, whose order differs from one process to the next."""
     info = {"counts": {"frames": 1}, "seconds": {}}
     pages = [
-        index_page("runs", [Listed("0.html", "run 0", info, Tally(Counter(names), 0, 0), 0, ())])
+        index_page(
+            "runs", [Listed("0.html", "run 0", info, TrackCounts(Counter(names), 0, 0), 0, ())]
+        )
         for names in (["cup", "can", "box", "box"], ["box", "can", "cup", "box"])
     ]
 

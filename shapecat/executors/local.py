@@ -11,7 +11,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from shapecat.executors.interface import WorkerExecutor
-from shapecat.executors.worker import Task, Worker, WorkerLostError
+from shapecat.executors.worker import Call, Worker, WorkerLostError
 
 __all__ = ["LocalExecutor"]
 
@@ -41,7 +41,7 @@ class LocalExecutor(WorkerExecutor):
         if workers < 1:
             msg = f"workers must be at least 1, got {workers}"
             raise ValueError(msg)
-        self._tasks: SimpleQueue[Task | None] = SimpleQueue()
+        self._tasks: SimpleQueue[Call | None] = SimpleQueue()
         self._ahead = ahead
         self._closed = False
         self._workers: dict[int, Worker] = {}
@@ -66,7 +66,7 @@ class LocalExecutor(WorkerExecutor):
         if self._closed:
             msg = "cannot submit after shutdown"
             raise RuntimeError(msg)
-        task = Task(Future(), (fn, args, kwargs))
+        task = Call(Future(), (fn, args, kwargs))
         if self._dispatchers:
             self._tasks.put(task)
         else:

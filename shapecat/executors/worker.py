@@ -20,7 +20,7 @@ from shapecat.system import stopping
 from shapecat.system.garbage import collect_seldom
 from shapecat.system.libraries import block_unused
 
-__all__ = ["Task", "Worker", "WorkerLostError"]
+__all__ = ["Call", "Worker", "WorkerLostError"]
 
 # Spawned, not forked: the threads of numeric and Rerun libraries do not survive a fork.
 _SPAWN = get_context("spawn")
@@ -30,7 +30,7 @@ class WorkerLostError(RuntimeError):
     """The process that worked on a task died: killed, out of memory, or crashed."""
 
 
-class Task(NamedTuple):
+class Call(NamedTuple):
     """A call, and the future of its result."""
 
     future: Future[Any]
@@ -61,7 +61,7 @@ class Worker:
             self.process.start()
         child_socket.close()
         stop_pipe.close()
-        self._sent: SimpleQueue[Task | None] = SimpleQueue()
+        self._sent: SimpleQueue[Call | None] = SimpleQueue()
         self._listener = threading.Thread(target=self._listen, args=(capacity,), daemon=True)
         try:
             self._listener.start()
@@ -75,7 +75,7 @@ class Worker:
         """Make `stopping.asked` return True in the process."""
         self._stop_pipe.close()
 
-    def send(self, task: Task) -> None:
+    def send(self, task: Call) -> None:
         """Queue a call in the process.
 
         The listener thread sets the task's future when the result arrives.

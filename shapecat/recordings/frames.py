@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from shapecat.errors import ConfigError
 from shapecat.recordings.messages import Message, Needed
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.sources import SOURCES, DepthSource, Source
+from shapecat.recordings.sources import SOURCES, DepthSource, FrameSource
 from shapecat.recordings.streams import Stream
 from shapecat.types import Frame
 
@@ -95,7 +95,7 @@ def frames(
     ------
     Frames by log time. Their ``index`` counts the messages of their stream, from 0 at ``start_s``.
     """
-    sources: dict[str, Source] = {
+    sources: dict[str, FrameSource] = {
         stream.topic: SOURCES[stream.kind](recording, stream, skipped) for stream in streams
     }
     infos: dict[str, list[DepthSource]] = {}

@@ -34,10 +34,10 @@ from shapecat.recordings.streams import COMPRESSED, Stream, first_message
 from shapecat.recordings.viewpoint import find_viewpoint, seen_from
 from shapecat.types import Frame, Pose
 
-__all__ = ["SOURCES", "DepthSource", "PointsSource", "Source"]
+__all__ = ["SOURCES", "DepthSource", "FrameSource", "PointsSource"]
 
 
-class Source:
+class FrameSource:
     """Converts the messages of a depth stream to frames, one after the other."""
 
     def __init__(self, recording: Recording, stream: Stream, skipped: Counter[str]) -> None:
@@ -83,7 +83,7 @@ class Source:
         )
 
 
-class PointsSource(Source):
+class PointsSource(FrameSource):
     """A stream of clouds; organized ones become depth images if a pinhole camera fits."""
 
     def __init__(self, recording: Recording, stream: Stream, skipped: Counter[str]) -> None:
@@ -126,7 +126,7 @@ def _placed(points: F4, pose: Pose | None) -> F4:
     return points if pose is None else transform(pose, points).astype(np.float32)
 
 
-class DepthSource(Source):
+class DepthSource(FrameSource):
     """A stream of depth images. Each image waits for the calibration with the same stamp."""
 
     def __init__(self, recording: Recording, stream: Stream, skipped: Counter[str]) -> None:
@@ -235,7 +235,7 @@ def _depth_units(recording: Recording, topic: str) -> float | None:
     return None
 
 
-SOURCES: dict[str, type[Source]] = {
+SOURCES: dict[str, type[FrameSource]] = {
     "points": PointsSource,
     "depth": DepthSource,
 }

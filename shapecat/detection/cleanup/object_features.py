@@ -81,12 +81,12 @@ def measure_object_features(
     metres.
     """
     features = np.zeros(oversegmentation.segments.parent.size, OBJECT_FEATURES)
-    limits = Limits(*_border_lines(grid), 1 / range_m + DISCONTINUITY / 2)
+    limits = ViewLimits(*_border_lines(grid), 1 / range_m + DISCONTINUITY / 2)
     _measure(grid, model, oversegmentation, limits, features)
     return features
 
 
-class Limits(NamedTuple):
+class ViewLimits(NamedTuple):
     """Limits of the view: the borders of the image and the range.
 
     Attributes
@@ -114,7 +114,7 @@ def _measure(
     grid: DepthGrid,
     model: PlaneModel,
     oversegmentation: OverSegmentation,
-    limits: Limits,
+    limits: ViewLimits,
     out: Records,
 ) -> None:
     """Write the features of the segments that were not merged into another."""
@@ -152,7 +152,7 @@ def _count_by_segment(
     grid: DepthGrid,
     model: PlaneModel,
     oversegmentation: OverSegmentation,
-    limits: Limits,
+    limits: ViewLimits,
     out: Records,
 ) -> F8:
     """Count the cells of each segment at borders and on walls, and where its surface continues.

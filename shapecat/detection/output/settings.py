@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-__all__ = ["OUTPUT", "OutputSettings"]
+__all__ = ["OUTPUT", "OutputConstants"]
 
 
-class OutputSettings(NamedTuple):
+class OutputConstants(NamedTuple):
     """Constants for measuring and labelling objects."""
 
     occluded_share: float = 0.12
@@ -40,4 +40,4 @@ class OutputSettings(NamedTuple):
     """Fraction of points behind others above which a cloud counts as fused from several views."""
 
 
-OUTPUT = OutputSettings()
+OUTPUT = OutputConstants()

@@ -27,7 +27,7 @@ from shapecat.types import UNKNOWN, Frame, LabelledFrame, LabelledObject
 __all__ = [
     "DatasetImage",
     "DatasetObject",
-    "Selection",
+    "ImageSelection",
     "image_stems",
     "images_of",
     "snapped_masks",
@@ -39,7 +39,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Selection:
+class ImageSelection:
     """Options of a data set.
 
     Attributes
@@ -115,7 +115,7 @@ def image_stems(runs: Sequence[FinishedRun]) -> list[dict[str, str]]:
 
 def images_of(
     finished: FinishedRun,
-    selection: Selection,
+    selection: ImageSelection,
     recording: Path | None = None,
     *,
     stems: Mapping[str, str],
@@ -160,7 +160,7 @@ def images_of(
                 yield image
 
 
-def _is_sure(item: LabelledObject, selection: Selection, corrected: set[int]) -> bool:
+def _is_sure(item: LabelledObject, selection: ImageSelection, corrected: set[int]) -> bool:
     """Return whether the label of an object is certain enough for training; *unknown* never is.
 
     ``corrected`` are the numbers of the tracks that a person labelled.
@@ -176,7 +176,7 @@ def _image(
     labelled: LabelledFrame,
     frame: Frame,
     coloured: Coloured | None,
-    selection: Selection,
+    selection: ImageSelection,
     corrected: set[int],
 ) -> DatasetImage | None:
     """Return the image of a frame, named ``name`` with a suffix; None if the frame has no image."""
@@ -223,7 +223,7 @@ def snapped_masks(frame: Frame, coloured: Coloured, pixels: U1) -> tuple[Mask, .
 
 
 def _chosen(
-    finished: FinishedRun, selection: Selection, corrected: set[int]
+    finished: FinishedRun, selection: ImageSelection, corrected: set[int]
 ) -> set[tuple[str, int]]:
     """Return the selected frames, by topic and number.
 

@@ -16,7 +16,7 @@ from shapecat.outputs.exports.coco import DATASETS
 from shapecat.outputs.exports.crops import write_crops
 from shapecat.outputs.exports.dataset_frames import (
     DatasetImage,
-    Selection,
+    ImageSelection,
     image_stems,
     images_of,
     split_runs,
@@ -139,7 +139,7 @@ def export_dataset(
     runs: Sequence[FinishedRun],
     format: str,  # noqa: A002  # the word users know
     out: Path,
-    selection: Selection,
+    selection: ImageSelection,
     *,
     recording: Path | None = None,
     observe: Observer = ignore,
@@ -179,7 +179,7 @@ def export_dataset(
 
 def _labelled_images(
     runs: Sequence[FinishedRun],
-    selection: Selection,
+    selection: ImageSelection,
     counts: Exported,
     recording: Path | None,
     observe: Observer,

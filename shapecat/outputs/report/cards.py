@@ -22,7 +22,7 @@ from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.labels.track_table import TrackRow
 from shapecat.types import UNKNOWN
 
-__all__ = ["Card", "Tally", "asset", "card_html", "count_cards", "frame_html", "template"]
+__all__ = ["Card", "TrackCounts", "asset", "card_html", "count_cards", "frame_html", "template"]
 
 _LINES = 3  # categories in a timeline
 _MOST_STEPS = 80
@@ -50,7 +50,7 @@ def template(name: str) -> Template:
     return Template(asset(name))
 
 
-class Tally(NamedTuple):
+class TrackCounts(NamedTuple):
     """Counts of the tracks of a run, as their labels say; `cards.js` counts in the same way.
 
     ``categories`` counts tracks, where merged tracks count as one. ``unsure`` is the number of
@@ -62,10 +62,10 @@ class Tally(NamedTuple):
     checked: int
 
 
-def count_cards(cards: Sequence[Card], labels: Mapping[int, TrackLabel]) -> Tally:
+def count_cards(cards: Sequence[Card], labels: Mapping[int, TrackLabel]) -> TrackCounts:
     """Count the tracks of the cards; ``labels`` are their final labels."""
     objects = {labels[card.row.track] for card in cards if card.row.track in labels}
-    return Tally(
+    return TrackCounts(
         Counter(label.category for label in objects),
         unsure=sum(card.row.label == "" and _is_unsure(card.row) for card in cards),
         checked=sum(card.row.label != "" for card in cards),

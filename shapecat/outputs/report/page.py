@@ -17,7 +17,7 @@ from shapecat.outputs.colours import hex_colour
 from shapecat.outputs.counts import by_count, count_words, plural, size_words
 from shapecat.outputs.report.cards import (
     Card,
-    Tally,
+    TrackCounts,
     asset,
     card_html,
     count_cards,
@@ -45,7 +45,7 @@ class Listed:
     link: str
     name: str
     info: Mapping[str, Any]
-    tally: Tally
+    tally: TrackCounts
     warnings: int
     faces: tuple[str, ...]
 

@@ -23,7 +23,7 @@ from shapecat.outputs.report.surfaces import recoloured
 from shapecat.outputs.report.tracks import Timeline, read_length, read_stage_seconds, read_timelines
 from shapecat.runs.finished import find_runs, read_finished
 from shapecat.runs.folder import require_work
-from shapecat.runs.labels.corrections import read_original_table
+from shapecat.runs.labels.corrections import read_labelled_table
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.labels.track_table import TrackTable
 from shapecat.system.files import replacing
@@ -111,7 +111,7 @@ class RunReport:
 
     @property
     def _table(self) -> TrackTable:
-        return read_original_table(self.folder / "tracks.csv")[0]
+        return read_labelled_table(self.folder / "tracks.csv")[0]
 
     def _cards(self, table: TrackTable) -> list[Card]:
         return [
@@ -226,7 +226,7 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
     OutputError : the folder is not a finished run, or its tracks.csv is invalid.
     """
     finished = read_finished(folder)
-    rows = read_original_table(folder / "tracks.csv")[0].rows
+    rows = read_labelled_table(folder / "tracks.csv")[0].rows
     timelines = read_timelines(folder)
     pictures = take_pictures(finished, rows, choose_frames(folder, timelines))
     work, stages = finished.info["work"], read_stage_seconds(folder)

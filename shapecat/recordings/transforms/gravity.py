@@ -17,7 +17,7 @@ from shapecat.recordings.transforms.imu import Accelerometers
 from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.types import Frame, Pose
 
-__all__ = ["MISNAMINGS", "Misnaming", "Orientation", "Upright", "has_z_up", "turned"]
+__all__ = ["MISNAMINGS", "Misnaming", "Orientation", "PoseFinder", "has_z_up", "turned"]
 
 _LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
 """Frames whose z axis is up by convention (REP 105, REP 103), even after the name of a robot."""
@@ -72,7 +72,7 @@ class Orientation(NamedTuple):
 
 
 @dataclass
-class Upright:
+class PoseFinder:
     """Finds the up direction and the sensor pose of each frame.
 
     Frames must be looked up in the order of the recording, since only a little of the past is kept.
@@ -118,7 +118,7 @@ class Upright:
         up: str,
         fixed_frame: str | None,
         streams: Sequence[Stream] = (),
-    ) -> "Upright":
+    ) -> "PoseFinder":
         """Prepare to look up frames of a recording; read its first transforms and accelerations.
 
         Parameters

@@ -32,8 +32,8 @@ __all__ = [
     "adopt_labels",
     "correct_label",
     "has_labels",
+    "read_labelled_table",
     "read_labels",
-    "read_original_table",
     "relabel",
 ]
 
@@ -59,13 +59,13 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
     OutputError : the table is unreadable, belongs to another run, or has invalid lines, which the
         error message lists.
     """
-    table, problems = read_original_table(path)
+    table, problems = read_labelled_table(path)
     labels, misread = resolve_labels(table.rows, categories, one_frame=_one_frame(path.parent))
     _refuse(path, [*problems, *_lines(table.rows, misread)], "the table cannot be used")
     return labels
 
 
-def read_original_table(path: Path) -> tuple[TrackTable, list[str]]:
+def read_labelled_table(path: Path) -> tuple[TrackTable, list[str]]:
     """Read the tracks.csv of a run, and restore what a person must not change.
 
     Labels and added columns are from tracks.csv, other cells and the order from
@@ -160,23 +160,23 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
 
 def _adopt(corrected: Path, folder: Path) -> None:
     current = folder / "tracks.csv"
-    original, problems = read_original_table(current)
-    result = original
+    before, problems = read_labelled_table(current)
+    result = before
     if not (corrected.exists() and corrected.samefile(current)):
         _refuse(current, problems)
         table = read_track_table(corrected)
         require_same_run(corrected, table, folder, own=False)
         changed = (row for row in table.rows if row.cells.get(LABEL_SEEN) != row.label)
         result, problems = (
-            _relabelled(original, changed),
-            [*table.problems, *_contradictions(table, original)],
+            _relabelled(before, changed),
+            [*table.problems, *_contradictions(table, before)],
         )
     known_categories = read_run(folder)["model"]["categories"]
     _, misread = resolve_labels(result.rows, known_categories, one_frame=_one_frame(folder))
     _refuse(corrected, problems + _lines(result.rows, misread))
-    if any(a.label not in {"", b.label} for a, b in zip(original.rows, result.rows, strict=True)):
+    if any(a.label not in {"", b.label} for a, b in zip(before.rows, result.rows, strict=True)):
         with replacing(folder / PREVIOUS) as path:
-            write_track_table(path, original)
+            write_track_table(path, before)
     with replacing(current.resolve()) as path:  # it may be a symbolic link
         write_track_table(path, result)
 
@@ -194,7 +194,7 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
         written.
     """
     current = folder / "tracks.csv"
-    base, problems = read_original_table(current)
+    base, problems = read_labelled_table(current)
     categories, one_frame = read_run(folder)["model"]["categories"], _one_frame(folder)
     before = find_misread(base.rows, categories, one_frame=one_frame)
     _refuse(current, [*problems, *_lines(base.rows, before)])

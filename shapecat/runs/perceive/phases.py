@@ -17,7 +17,7 @@ from shapecat.perception import Perceiver, PerceptionInput
 from shapecat.recordings import Recording, Stream
 from shapecat.recordings.colour_motion import view_at_its_time
 from shapecat.recordings.colour_streams import ColourStream
-from shapecat.recordings.transforms.gravity import Upright
+from shapecat.recordings.transforms.gravity import PoseFinder
 from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceive.clocks import explain_transform_clocks
@@ -70,15 +70,15 @@ def perceive_all(work: Work) -> None:
     recent = RecentFrames(job.settings.detection.fuse_frames)
     total = count_frames(work.streams, run["options"])
     with _perceiving(work, "perceive", total) as perceive:
-        upright = _upright(work, job.fixed_frame)
+        poses = _pose_finder(work, job.fixed_frame)
 
         def view(oriented: Oriented) -> _Item:
             frame, colour, (_, _, pose) = oriented
-            up = upright.accept(frame.topic, oriented[2])
+            up = poses.accept(frame.topic, oriented[2])
             row = FrameRow(frame.log_time_ns, pose, up, frame_from_sensor=frame.frame_from_sensor)
             return row, PerceptionInput(frame, up, recent.before(frame, pose), pose, colour)
 
-        count, resumed = perceive(map(view, _oriented(work, upright, skipped)))
+        count, resumed = perceive(map(view, _oriented(work, poses, skipped)))
     if not count:
         reasons = ", ".join(f"{n} {reason}" for reason, n in skipped.items()) or "none in range"
         msg = f"{job.source}: no usable frame on {', '.join(run['options']['topics'])} ({reasons})"
@@ -89,14 +89,14 @@ def perceive_all(work: Work) -> None:
         run["counts"]["color"] = count_rows(folder, "masks")
     if resumed:
         run["counts"]["resumed"] = resumed
-    run["fixed_frame"], run["up"] = upright.fixed_frame, report_up(upright, folder)
-    if upright.fixed_frame is not None:
+    run["fixed_frame"], run["up"] = poses.fixed_frame, report_up(poses, folder)
+    if poses.fixed_frame is not None:
         frame_ids = {stream.topic: stream.frame_id for stream in work.streams}
-        upright.warnings += explain_transform_clocks(
-            folder, upright.transforms, upright.fixed_frame, frame_ids
+        poses.warnings += explain_transform_clocks(
+            folder, poses.transforms, poses.fixed_frame, frame_ids
         )
     lost = [f"skipped frames ({n}×): {reason}" for reason, n in skipped.most_common(3)]
-    run["warnings"] = [*lost, *recording.warnings, *upright.warnings, *recent.warnings()]
+    run["warnings"] = [*lost, *recording.warnings, *poses.warnings, *recent.warnings()]
     if recording.damaged:
         run["damaged"] = True
 
@@ -120,9 +120,9 @@ def revise(work: Work) -> None:
 
 def _views_again(work: Work, chosen: dict[Key, Revision]) -> Iterator[_Item]:
     """Yield the chosen frames with their revised up directions."""
-    upright = _upright(work, work.run["fixed_frame"])
+    poses = _pose_finder(work, work.run["fixed_frame"])
     recent = RecentFrames(work.job.settings.detection.fuse_frames)
-    for frame, colour, (_, _, pose) in _oriented(work, upright, Counter()):
+    for frame, colour, (_, _, pose) in _oriented(work, poses, Counter()):
         earlier = recent.before(frame, pose)
         revision = chosen.get((frame.topic, frame.index))
         if revision is not None:
@@ -197,23 +197,23 @@ def _blocks(
         yield rows, perceptions
 
 
-def _upright(work: Work, fixed_frame: str | None) -> Upright:
+def _pose_finder(work: Work, fixed_frame: str | None) -> PoseFinder:
     streams = work.streams
-    return Upright.of(work.recording, up=work.job.up, fixed_frame=fixed_frame, streams=streams)
+    return PoseFinder.of(work.recording, up=work.job.up, fixed_frame=fixed_frame, streams=streams)
 
 
-def _oriented(work: Work, upright: Upright, skipped: Counter[str]) -> Iterator[Oriented]:
+def _oriented(work: Work, poses: PoseFinder, skipped: Counter[str]) -> Iterator[Oriented]:
     """Yield the frames of a run with their orientations, once the up directions are decided."""
-    source = (_placed(upright, *reading) for reading in _readings(work, skipped))
-    for frame, colour, orientation in UpCheck(upright, work.job.settings).before(source):
-        yield frame, colour, upright.corrected(frame.topic, orientation)
+    source = (_placed(poses, *reading) for reading in _readings(work, skipped))
+    for frame, colour, orientation in UpCheck(poses, work.job.settings).before(source):
+        yield frame, colour, poses.corrected(frame.topic, orientation)
 
 
-def _placed(upright: Upright, frame: Frame, colour: ColourView | None) -> Oriented:
+def _placed(poses: PoseFinder, frame: Frame, colour: ColourView | None) -> Oriented:
     """Look up the orientation of a frame, and the pose of its colour camera."""
-    orientation = upright.orient(frame)
-    pose = upright.corrected(frame.topic, orientation).fixed_from_sensor
-    view = view_at_its_time(colour, frame, pose, upright.fixed_frame, lambda: upright.transforms)
+    orientation = poses.orient(frame)
+    pose = poses.corrected(frame.topic, orientation).fixed_from_sensor
+    view = view_at_its_time(colour, frame, pose, poses.fixed_frame, lambda: poses.transforms)
     return frame, view, orientation
 
 

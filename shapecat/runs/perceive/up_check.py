@@ -15,7 +15,7 @@ from shapecat.perception import find_up
 from shapecat.recordings.transforms.gravity import (
     MISNAMINGS,
     Orientation,
-    Upright,
+    PoseFinder,
     has_z_up,
     turned,
 )
@@ -42,8 +42,8 @@ Oriented = tuple[Frame, ColourView | None, Orientation]
 class UpCheck:
     """Compares the given up direction with the planes in the first frames of each topic."""
 
-    def __init__(self, upright: Upright, settings: Settings) -> None:
-        self._upright, self._settings = upright, settings
+    def __init__(self, poses: PoseFinder, settings: Settings) -> None:
+        self._poses, self._settings = poses, settings
         self._off_deg: dict[str, list[float]] = {}
         self._misnamed_off_deg: dict[str, list[list[float]]] = {}  # per frame and misnaming
         self._sources: dict[str, str] = {}
@@ -78,7 +78,7 @@ class UpCheck:
         hint, off = orientation.up, self._off_deg.get(frame.topic, [])
         elsewhere = frame.points is not None and has_z_up(frame.frame_id)
         if elsewhere and self._looks[frame.topic] == 1:
-            self._upright.warnings.append(
+            self._poses.warnings.append(
                 f"{frame.topic}: its clouds are in {frame.frame_id}, which is not the frame of a "
                 "camera: objects may be missed or split; use its depth images, if recorded"
             )
@@ -117,9 +117,9 @@ class UpCheck:
         worst = np.max(self._misnamed_off_deg[topic], axis=0)
         fits = [m for m, off_deg in zip(MISNAMINGS, worst, strict=True) if off_deg <= _MISNAMED_DEG]
         if source.startswith("transforms") and fits:
-            self._upright.assume_misnamed(topic, fits[0])
+            self._poses.assume_misnamed(topic, fits[0])
         else:
-            self._upright.contradict(topic, source, off)
+            self._poses.contradict(topic, source, off)
 
 
 def _angle_deg(a: F4, b: F4) -> float:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from shapecat.errors import listed
-from shapecat.recordings.transforms.gravity import Upright
+from shapecat.recordings.transforms.gravity import PoseFinder
 from shapecat.runs.tables.placed_frames import count_poses
 from shapecat.runs.tables.reading import keys_of, read_together
 
@@ -16,38 +16,38 @@ __all__ = ["report_up"]
 _DISAGREE_DEG = 10
 
 
-def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
+def report_up(poses: PoseFinder, folder: Path) -> dict[str, Any]:
     """Return the source of the up direction and its agreement with the planes, for run.json.
 
     Failed look-ups, gaps, contradictions, their consequences, and large differences are added to
-    the warnings of ``upright``.
+    the warnings of ``poses``.
 
     Parameters
     ----------
     folder : folder with the tables of frames, planes and detections.
     """
-    if upright.failed:
-        upright.warnings.append(
-            f"failed transform look-ups: {upright.failed}, the first: {upright.first_failure}"
+    if poses.failed:
+        poses.warnings.append(
+            f"failed transform look-ups: {poses.failed}, the first: {poses.first_failure}"
         )
-    if upright.longest_gap is not None:
-        gap = upright.longest_gap
-        upright.warnings.append(
-            f"frames without pose ({upright.in_gaps}×): gaps of up to {gap.gap_s:.2f} s in the "
+    if poses.longest_gap is not None:
+        gap = poses.longest_gap
+        poses.warnings.append(
+            f"frames without pose ({poses.in_gaps}×): gaps of up to {gap.gap_s:.2f} s in the "
             f"transforms of {gap.frame_id}, which moves meanwhile"
         )
-    if upright.transforms.contradicted:
-        frames = listed(upright.transforms.contradicted)
-        upright.warnings.append(
+    if poses.transforms.contradicted:
+        frames = listed(poses.transforms.contradicted)
+        poses.warnings.append(
             f"transforms: a clock was set back, and those of {frames} have the stamps of different "
             "earlier ones: poses may be those of another time; split the recording where its "
             "stamps go backwards"
         )
-    upright.warnings += _missing_poses(folder, upright)
-    uses = upright.given
+    poses.warnings += _missing_poses(folder, poses)
+    uses = poses.given
     report: dict[str, Any] = {"source": max(uses, key=lambda name: uses[name], default="planes")}
-    if upright.dropped:
-        report["dropped"] = dict(upright.dropped)
+    if poses.dropped:
+        report["dropped"] = dict(poses.dropped)
     if len(uses) > 1:
         report["frames"] = dict(uses)
     if set(uses) - {"planes"}:
@@ -55,26 +55,26 @@ def report_up(upright: Upright, folder: Path) -> dict[str, Any]:
         typical = round(float(np.median(angles)), 1) if angles else None
         report |= {"planes_differ_deg": typical, "frames_without_plane": bare}
         if typical is not None and typical > _DISAGREE_DEG:
-            upright.warnings.append(
+            poses.warnings.append(
                 f"up and the detected planes differ by {typical} degrees; try another --up "
                 "(tf, imu, or X,Y,Z)"
             )
     return report
 
 
-def _missing_poses(folder: Path, upright: Upright) -> Iterator[str]:
+def _missing_poses(folder: Path, poses: PoseFinder) -> Iterator[str]:
     """Yield a warning for each topic with frames whose pose in the fixed frame is unknown.
 
     Without a fixed frame, there is a warning if something moves, since it may be the sensor.
     """
-    fixed_frame = upright.fixed_frame
-    if fixed_frame is None and upright.transforms.moves:
+    fixed_frame = poses.fixed_frame
+    if fixed_frame is None and poses.transforms.moves:
         for topic in count_poses(folder):
             yield (
                 f"{topic}: no transforms lead from the frame of its sensor to a fixed frame: its "
                 "tracks are in the frame of the sensor, which may move"
             )
-    if fixed_frame is None or not (upright.failed or upright.in_gaps):
+    if fixed_frame is None or not (poses.failed or poses.in_gaps):
         return
     for topic, (with_pose, count) in count_poses(folder).items():
         loss = ", whose objects are not tracked"
