@@ -127,16 +127,16 @@ def context(
     wide, across, along = _extents(surface.points, high - low, surface.eye, out[:5])
     _spreads(x, y, z, weight, normals, out[5:12])
     _harmonics(weight, normals, out[12:15])
-    level = np.zeros(x.size)
+    rise = np.zeros(x.size)
     for i in range(x.size):
-        level[i] = (z[i] - low) / (high - low) if high > low else 0.5
-    _facing(level, weight, normals, out[15:20])
-    _axis(x, y, upright, level, high - low, weight, normals, out[20:29])
+        rise[i] = (z[i] - low) / (high - low) if high > low else 0.5
+    _facing(rise, weight, normals, out[15:20])
+    _axis(x, y, upright, rise, high - low, weight, normals, out[20:29])
     residual, size, middle = _sphere(x, y, z, weight)
     out[29] = min(residual, 1.0)
     out[30] = 1.0 / (1.0 + size)
     out[31] = min(max((middle - low) / max(high - low, 1e-3), -2.0), 3.0)
-    _heights(level, weight, curvatures, out[32:36])
+    _heights(rise, weight, curvatures, out[32:36])
     _around(surface.euclidean, surface.geodesic, out[36:39])
     out[39] = _ratio(max(low - base, 0.0), high - low)
     return wide, across, along
@@ -224,20 +224,20 @@ def _harmonics(weight: F4, normals: F4, out: F4) -> None:
 
 
 @kernel(inline=True)
-def _facing(level: F8, weight: F4, normals: F4, out: F4) -> None:
+def _facing(rise: F8, weight: F4, normals: F4, out: F4) -> None:
     """Write the fractions of the surface that face up, sideways and down.
 
-    Then follow the fractions that face up near the top and near the bottom. ``level`` (k,) is the
+    Then follow the fractions that face up near the top and near the bottom. ``rise`` (k,) is the
     height of each neuron, 0 at the bottom and 1 at the top; ``weight`` and ``normals`` are as in
     `_spreads`; ``out`` is (5,).
     """
-    for i in range(level.size):
+    for i in range(rise.size):
         w, up = weight[i], normals[2, i]
         out[0] += w * (up > 0.8)
         out[1] += w * (abs(up) < 0.4)
         out[2] += w * (up < -0.25)
-        out[3] += w * (up > 0.7 and level[i] > 0.75)
-        out[4] += w * (up > 0.7 and level[i] < 0.3)
+        out[3] += w * (up > 0.7 and rise[i] > 0.75)
+        out[4] += w * (up > 0.7 and rise[i] < 0.3)
 
 
 @kernel(inline=True)
@@ -245,7 +245,7 @@ def _axis(
     x: F4,
     y: F4,
     upright: VerticalAxis,
-    level: F8,
+    rise: F8,
     height: float,
     weight: F4,
     normals: F4,
@@ -253,7 +253,7 @@ def _axis(
 ) -> None:
     """Compare the surface with a surface of revolution about an upright axis.
 
-    ``level`` is as in `_facing`, ``height`` is that of the object; the other parameters are as in
+    ``rise`` is as in `_facing`, ``height`` is that of the object; the other parameters are as in
     `_spreads`. Writes to ``out`` (9,).
     """
     cx, cy, residual = upright
@@ -264,7 +264,7 @@ def _axis(
         rx, ry = x[i] - cx, y[i] - cy
         r = np.sqrt(rx * rx + ry * ry)
         flat = np.sqrt(normals[0, i] ** 2 + normals[1, i] ** 2)
-        half = 1 if level[i] > 0.5 else 0
+        half = 1 if rise[i] > 0.5 else 0
         parts[half, 0] += w
         parts[half, 1] += w * r
         if flat > 0.3 and rx * normals[0, i] + ry * normals[1, i] < 0:
@@ -272,12 +272,12 @@ def _axis(
             out[5 - half] += w
         radius += w * r
         radius2 += w * r * r
-        middle += w * level[i]
+        middle += w * rise[i]
     slope = spread = 0.0
     for i in range(x.size):
         r = np.sqrt((x[i] - cx) ** 2 + (y[i] - cy) ** 2)
-        slope += weight[i] * (level[i] - middle) * (r - radius)
-        spread += weight[i] * (level[i] - middle) ** 2
+        slope += weight[i] * (rise[i] - middle) * (r - radius)
+        spread += weight[i] * (rise[i] - middle) ** 2
     out[0] = _ratio(radius, height)
     out[1] = np.sqrt(max(radius2 - radius * radius, 0.0)) / max(radius, 1e-6)
     out[2] = min(residual / max(radius, 1e-6), 2.0)
@@ -287,17 +287,17 @@ def _axis(
 
 
 @kernel(inline=True)
-def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
-    """Write mean, deviation and skew of heights ``level`` (n,), and the share of convex surface.
+def _heights(rise: F8, weight: F4, curvatures: F4, out: F4) -> None:
+    """Write mean, deviation and skew of heights ``rise`` (n,), and the share of convex surface.
 
     ``weight`` (k,) is as in `_sphere`, ``curvatures`` (2, k) from `fit_surfaces`; ``out`` is (4,).
     """
     mean = second = third = 0.0
-    for i in range(level.size):
-        mean += weight[i] * level[i]
+    for i in range(rise.size):
+        mean += weight[i] * rise[i]
         out[3] += weight[i] * (curvatures[0, i] + curvatures[1, i] > 0)
-    for i in range(level.size):
-        off = level[i] - mean
+    for i in range(rise.size):
+        off = rise[i] - mean
         second += weight[i] * off * off
         third += weight[i] * off * off * off
     out[0] = mean

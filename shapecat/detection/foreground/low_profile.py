@@ -148,10 +148,10 @@ def _mark_objects(
     flat, marks, plane_ids = high_pass.reshape(-1), object_ids.reshape(-1), plane_id.reshape(-1)
     flooded, part, seeds, cells = scratch
     visited, part_of = flooded.reshape(-1), part.reshape(-1)
-    n = _find_seeds(high_pass, limits.level * LOW.levels[-1], seeds)
+    n = _find_seeds(high_pass, limits.unit * LOW.levels[-1], seeds)
     merits = np.zeros(1 + objects + len(LOW.levels) * (flat.size // LOW.min_cells), np.float32)
     for multiple in LOW.levels:
-        level = np.float32(limits.level * multiple)
+        level = np.float32(limits.unit * multiple)
         first = parts
         for s in seeds[:n]:
             if visited[s] > first or not flat[s] > level:

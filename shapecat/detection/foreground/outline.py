@@ -18,13 +18,13 @@ class Limits(NamedTuple):
     Attributes
     ----------
     rise : minimum mean rise across the outline of an object, 1/m.
-    level : unit of `LowProfileSettings.levels`, 1/m.
+    unit : what `LowProfileSettings.levels` are multiples of, 1/m.
     width : largest width of an object, in cells at a depth of 1 m.
     discontinuity : step that separates two surfaces, 1/m.
     """
 
     rise: float
-    level: np.float32
+    unit: np.float32
     width: float
     discontinuity: float
 

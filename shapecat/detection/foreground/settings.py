@@ -9,10 +9,10 @@ class LowProfileSettings(NamedTuple):
     """Constants that distinguish low-profile objects from low-frequency depth error."""
 
     levels: tuple[float, ...] = (3.0, 2.0, 1.3, 0.9, 0.6)
-    """Thresholds above the local mean, as multiples of `Limits.level`. The outlines of the parts
+    """Thresholds above the local mean, as multiples of `Limits.unit`. The outlines of the parts
     above each are tested: one threshold separates an object from the depth error beside it."""
     fine: float = 0.006
-    """Upper bound of `Limits.level`, 1/m: larger rises come not from noise but from a plane at a
+    """Upper bound of `Limits.unit`, 1/m: larger rises come not from noise but from a plane at a
     grazing angle."""
     step: float = 0.002
     """Minimum mean rise across the outline of an object, 1/m: less than a disparity step of a

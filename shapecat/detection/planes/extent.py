@@ -98,9 +98,9 @@ def area_of(inliers: DepthSamples, plane: F8, distance: float) -> float:
     """
     total = 0.0
     for k in range(inliers.inverse_depth.size):
-        level = plane[0] * inliers.j[k] + plane[1] * inliers.i[k] + plane[2]
-        facing = level * distance  # the cosine between the normal and the ray
-        total += 1 / (level * level * (facing if facing > 0.05 else 0.05))
+        inverse_depth = plane[0] * inliers.j[k] + plane[1] * inliers.i[k] + plane[2]
+        facing = inverse_depth * distance  # the cosine between the normal and the ray
+        total += 1 / (inverse_depth * inverse_depth * (facing if facing > 0.05 else 0.05))
     return float(inliers.cells_per_sample * total)
 
 
@@ -135,12 +135,12 @@ def _extent_of(grid: DepthGrid, plane: F8, normal: F8, ends: I4) -> F8:
                 v, u = i + di, j + dj
                 if v < 0 or u < 0 or v >= rows or u >= columns:
                     continue
-                level = plane[0] * u + plane[1] * v + plane[2]
-                if level <= 0 or abs(inv_depth[v, u] - level) >= PLANES.tolerance:
+                of_plane = plane[0] * u + plane[1] * v + plane[2]
+                if of_plane <= 0 or abs(inv_depth[v, u] - of_plane) >= PLANES.tolerance:
                     continue
                 x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
-                p = (across[0] * x + across[1] * y + across[2]) / level
-                q = (along[0] * x + along[1] * y + along[2]) / level
+                p = (across[0] * x + across[1] * y + across[2]) / of_plane
+                q = (along[0] * x + along[1] * y + along[2]) / of_plane
                 for k in range(DIRECTIONS):
                     support = COS[k] * p + SIN[k] * q + PLANES.margin_m
                     extent[k] = support if support > extent[k] else extent[k]

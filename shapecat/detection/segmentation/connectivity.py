@@ -277,10 +277,10 @@ def _raise_concavity(
 
 
 @kernel(fast=True, inner=True)
-def _write_angles(level: F4, worst: F4, concavity: U1) -> None:
+def _write_angles(plane_w: F4, worst: F4, concavity: U1) -> None:
     """Write the angles of squared chords, in degrees; 0 for cells without a local plane.
 
-    All arrays are of the object cells of a row (n,): ``level``, the inverse depth of the local
+    All arrays are of the object cells of a row (n,): ``plane_w``, the inverse depth of the local
     planes; ``worst``, the squared chords from `_raise_concavity`; ``concavity``, which is written.
     """
     degrees, max_angle = np.float32(180 / math.pi), np.float32(120)
@@ -289,4 +289,4 @@ def _write_angles(level: F4, worst: F4, concavity: U1) -> None:
         # arcsin by its series: 1 degree off at a right angle
         angle = 2 * degrees * (half + half * half * half * np.float32(0.18))
         angle = angle if angle < max_angle else max_angle
-        concavity[k] = np.uint8(angle) if level[k] > np.float32(0) else np.uint8(0)
+        concavity[k] = np.uint8(angle) if plane_w[k] > np.float32(0) else np.uint8(0)

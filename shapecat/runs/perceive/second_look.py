@@ -75,7 +75,7 @@ class _Stream(NamedTuple):
     offsets: list[F4]
 
     @property
-    def level(self) -> Bool:
+    def has_plane(self) -> Bool:
         """Whether each frame has a plane, (n,)."""
         return np.array([len(offsets) > 0 for offsets in self.offsets], np.bool_)
 
@@ -99,7 +99,7 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
     for topic, stream in _streams(tables).items():
         posed = np.isfinite(stream.rotation[:, 0, 0])
         expected = _fixed_up(stream, posed) if 2 * posed.sum() > len(posed) else _still_up(stream)
-        off = ~stream.level | ~(_cosine(stream.up, expected) > _cos(_OFF_DEG))
+        off = ~stream.has_plane | ~(_cosine(stream.up, expected) > _cos(_OFF_DEG))
         off |= ~posed & _other_support(stream, off)
         agrees = _cosine(stream.given, expected) > _cos(_AGREES_DEG)
         for k in np.flatnonzero(np.isfinite(expected[:, 0]) & off & ~agrees):
@@ -117,7 +117,7 @@ def _fixed_up(stream: _Stream, posed: Bool) -> F8:
     a pose.
     """
     in_fixed = np.einsum("nij,nj->ni", stream.rotation, stream.up)
-    agreed = _agreed(in_fixed[posed & stream.level], _OFF_DEG, _FIXED_SHARE)
+    agreed = _agreed(in_fixed[posed & stream.has_plane], _OFF_DEG, _FIXED_SHARE)
     return np.asarray(np.einsum("nji,j->ni", stream.rotation, agreed))
 
 
@@ -126,10 +126,12 @@ def _still_up(stream: _Stream) -> F8:
 
     It is NaN if they do not agree, since the camera moved.
     """
-    level, expected = stream.level, np.full(stream.up.shape, np.nan)
+    has_plane, expected = stream.has_plane, np.full(stream.up.shape, np.nan)
     for k in range(len(expected)):
         neighbours = _around(stream, k)
-        expected[k] = _agreed(stream.up[neighbours][level[neighbours]], _STILL_DEG, _STILL_SHARE)
+        expected[k] = _agreed(
+            stream.up[neighbours][has_plane[neighbours]], _STILL_DEG, _STILL_SHARE
+        )
     return expected
 
 
