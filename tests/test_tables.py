@@ -182,7 +182,7 @@ def test_second_look_without_result_does_not_replace_frame(
     nothing = replace(perception(3, 0), scene=Scene(np.array([0, -1, 0]), (), ()))
     again = PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1", again=True)
     with again as tables:
-        rows = [FrameRow(2001, None, again=True), FrameRow(2003, None, again=True)]
+        rows = [FrameRow(2001, None), FrameRow(2003, None)]
         tables.write([perception(1, 3), nothing], rows)
 
     read = {n: pq.read_table(tmp_path / f"{n}.parquet") for n in ("frames", "detections", "planes")}
@@ -206,7 +206,7 @@ def test_second_look_replaces_frame_of_its_own_sensor(
             tmp_path, categories=CATEGORIES, model_id="m1", again=is_second
         ) as tables:
             for (topic, index), count in found.items():
-                row = FrameRow(2000 + index, None, again=is_second)
+                row = FrameRow(2000 + index, None)
                 tables.write([perception(index, count, topic)], [row])
 
     frames, detections, planes = (
@@ -234,7 +234,7 @@ def test_second_look_replaces_masks(tmp_path: Path) -> None:
             tables.write([masked(k, {1: (k, 0, 2, 1)})], [FrameRow(k, None)])
     with PerceptionTables(tmp_path, **options, again=True) as tables:
         boxes = {0: (3, 1, 1, 2), 2: (4, 2, 2, 2)}
-        tables.write([masked(2, boxes)], [FrameRow(2, None, again=True)])
+        tables.write([masked(2, boxes)], [FrameRow(2, None)])
 
     found = [(key[1], masks.boxes) for key, masks in read_masks(tmp_path)]
     assert found == [

@@ -42,14 +42,12 @@ class FrameRow:
     Attributes
     ----------
     up_given : (3,) up direction in the sensor frame, a unit vector; None if estimated from planes.
-    again : whether the frame is perceived for the second time.
     frame_from_sensor : as in `Frame`.
     """
 
     log_time_ns: int
     fixed_from_sensor: Pose | None
     up_given: F4 | None = None
-    again: bool = False
     frame_from_sensor: Pose | None = None
 
 
@@ -94,6 +92,7 @@ class PerceptionTables:
         self._schemas = {name: PERCEIVED[name].with_metadata(metadata) for name in names}
         self._categories = tuple(categories)
         self._pending: list[tuple[Perception, FrameRow]] = []
+        self._again = again
         self._place = folder / (REVISIONS if again else SEGMENTS)
         self._segments = list_segments(self._place)
         self._flushed = time.monotonic()
@@ -124,7 +123,7 @@ class PerceptionTables:
             return
         perceptions = [perception for perception, _ in self._pending]
         rows = {
-            "frames": _frame_columns(self._pending),
+            "frames": _frame_columns(self._pending, again=self._again),
             "detections": _detection_columns(self._pending, self._categories),
             "planes": _plane_columns(perceptions),
             "masks": mask_columns(perceptions),
@@ -151,8 +150,8 @@ class PerceptionTables:
                     writer.write_table(group[name])
 
 
-def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]]) -> dict[str, Any]:
-    """Return the columns of the frames table, by name."""
+def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]], *, again: bool) -> dict[str, Any]:
+    """Return the columns of the frames table, by name; ``again`` is as in `PerceptionTables`."""
     return {
         "topic": [p.topic for p, _ in rows],
         "frame": [p.index for p, _ in rows],
@@ -161,7 +160,7 @@ def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]]) -> dict[str, Any
         "frame_id": [p.frame_id for p, _ in rows],
         "up": [p.scene.up for p, _ in rows],
         "up_given": [row.up_given for _, row in rows],
-        "revised": [row.again and bool(p.scene.planes or p.detections) for p, row in rows],
+        "revised": [again and bool(p.scene.planes or p.detections) for p, _ in rows],
         "reused_from": [p.reused_from for p, _ in rows],
         **_pose_columns("fixed", [row.fixed_from_sensor for _, row in rows]),
         **_pose_columns("frame", [row.frame_from_sensor for _, row in rows]),

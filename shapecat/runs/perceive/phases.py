@@ -126,14 +126,8 @@ def _views_again(work: Work, chosen: dict[Key, Revision]) -> Iterator[_Item]:
         earlier = recent.before(frame, pose)
         revision = chosen.get((frame.topic, frame.index))
         if revision is not None:
-            sensor_pose = frame.frame_from_sensor
-            row = FrameRow(
-                frame.log_time_ns,
-                pose,
-                revision.up_given,
-                again=True,
-                frame_from_sensor=sensor_pose,
-            )
+            offset = frame.frame_from_sensor
+            row = FrameRow(frame.log_time_ns, pose, revision.up_given, frame_from_sensor=offset)
             yield row, PerceptionInput(frame, revision.up, earlier, pose, colour)
 
 
