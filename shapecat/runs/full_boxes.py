@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.completion import DIRECTIONS, BoxViews, FusedBox, fuse_boxes
 from shapecat.runs.tables.placed_frames import DetectedFrames
-from shapecat.runs.tables.reading import full_boxes_of, numbers, opened, read_rows
+from shapecat.runs.tables.reading import full_boxes_of, numbers, opened, partial_of, read_rows
 from shapecat.runs.tables.schemas import BOX_WIDTH, FULL_BOX, FULL_WIDTHS
 from shapecat.tracking import Track, view_weights
 
@@ -36,8 +36,7 @@ class _Selection(NamedTuple):
 
 def _boxes_of(table: pa.Table) -> F4:
     """Return the values of `_BOXES` (n, 11): full boxes, and 1 if the object is partly hidden."""
-    cut = np.logical_or(*(table[name].to_numpy() for name in _CUT))
-    return np.column_stack([full_boxes_of(table), cut])
+    return np.column_stack([full_boxes_of(table), partial_of(table)])
 
 
 def _details_of(table: pa.Table) -> F4:
@@ -46,8 +45,7 @@ def _details_of(table: pa.Table) -> F4:
     return np.hstack(columns)
 
 
-_CUT = ("touches_border", "occluded")
-_BOXES = _Selection([*FULL_BOX, *_CUT], BOX_WIDTH + 1, _boxes_of)
+_BOXES = _Selection([*FULL_BOX, "touches_border", "occluded"], BOX_WIDTH + 1, _boxes_of)
 """Centre, size (metres) and orientation (x y z w) of a detection's full box, NaN if unknown; and
 whether the object is occluded or cut off by the image border."""
 _DETAILS = _Selection(["size_full_std", "outline_full"], 3 + DIRECTIONS, _details_of)

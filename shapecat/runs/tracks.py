@@ -1,7 +1,7 @@
 """Track the detections of a run, and write the tables of tracks."""
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,14 @@ from shapecat.arrays import F4, F8
 from shapecat.config import TrackingSettings
 from shapecat.runs.full_boxes import FullBoxes, full_columns
 from shapecat.runs.labels.track_table import ORIGINAL, write_csv
-from shapecat.runs.tables.placed_frames import DetectedFrames, streams_with_poses
+from shapecat.runs.tables.placed_frames import DetectedFrames, sensor_poses, streams_with_poses
 from shapecat.runs.tables.reading import (
     first_stamp,
     frame_rows,
     keys_of,
     numbers,
     numbers_or_nan,
+    partial_of,
     read_together,
 )
 from shapecat.runs.tables.schemas import TRACKS
@@ -145,14 +146,15 @@ def _read_streams(folder: Path, categories: int, placed: set[str]) -> Iterator[D
     """
     streams: dict[str, TableBuilder] = {}
     count = 0
-    columns = {"frames": ("topic", "frame", "stamp_ns", "fixed_rotation"), "detections": _COLUMNS}
-    for frames, detections in read_together(folder, columns):
+    of_frames = ("topic", "frame", "stamp_ns", "fixed_translation", "fixed_rotation")
+    tables = {"frames": of_frames, "detections": _COLUMNS}
+    for frames, detections in read_together(folder, tables):
         keys, rows_of_key = keys_of(frames), frame_rows(detections)
         streams_of_frames = ["" if topic in placed else topic for topic, _ in keys]
         values = _columns_of(detections, categories)
         values["numbers"] = np.arange(count, count + detections.num_rows)
         count += detections.num_rows
-        stamps_ns, turns = numbers(frames["stamp_ns"]), _turns_of(frames, placed)
+        stamps_ns, turns = numbers(frames["stamp_ns"]), sensor_poses(frames, placed)[:, :, :3]
         for stream in dict.fromkeys(streams_of_frames):
             own = [k for k, name in enumerate(streams_of_frames) if name == stream]
             spans = [rows_of_key.get(keys[k], slice(0, 0)) for k in own]
@@ -180,7 +182,6 @@ def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
     ``categories`` is the number of categories.
     """
     first = table["reused_from"].combine_chunks()
-    cut_off = (table[name].to_numpy() for name in ("touches_border", "occluded"))
     return {
         "center": numbers(table["center"]).reshape(-1, 3),
         "center_fixed": numbers_or_nan(table["center_fixed"]),
@@ -188,20 +189,9 @@ def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
         "sizes": numbers(table["size"]).reshape(-1, 3),
         "posteriors": numbers(table["posterior"]).reshape(-1, categories),
         "novelties": table["novelty"].to_numpy(),
-        "partial": np.logical_or(*cut_off),
+        "partial": partial_of(table),
         "described": np.where(first.is_null(), table["frame"], first.fill_null(0)),
     }
-
-
-def _turns_of(frames: pa.Table, placed: Collection[str]) -> F8:
-    """Return the rotations (f, 3, 3) from sensor to fixed frame, one per row of ``frames``.
-
-    They are the identity where the pose is unknown or the topic is not in ``placed``.
-    """
-    turns = numbers_or_nan(frames["fixed_rotation"]).reshape(-1, 3, 3)
-    moved = np.array([topic in placed for topic in frames["topic"].to_pylist()])
-    moved = moved[:, None, None] & ~np.isnan(turns)
-    return np.where(moved, turns, np.eye(3))
 
 
 def _turned(orientations: F4, turns: F8) -> F8:

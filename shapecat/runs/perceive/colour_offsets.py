@@ -6,14 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from shapecat.runs.perceive.misplacement import APART_S, GAP_S, Centers, moved_m
-from shapecat.runs.tables.reading import (
-    frame_rows,
-    keys_of,
-    numbers,
-    numbers_or_nan,
-    read_together,
+from shapecat.runs.perceive.misplacement import (
+    APART_S,
+    CENTERS,
+    GAP_S,
+    Centers,
+    centers_of,
+    moved_m,
 )
+from shapecat.runs.tables.reading import keys_of, numbers, read_together
 
 __all__ = ["explain_colour_offsets"]
 
@@ -94,22 +95,14 @@ def explain_colour_offsets(folder: Path) -> Iterator[str]:
 def _read(folder: Path) -> dict[str, _Stream]:
     """Return the colour images of each depth topic."""
     streams: dict[str, _Stream] = {}
-    columns = ["topic", "frame"]
-    selected = {
-        "frames": [*columns, "stamp_ns"],
-        "detections": [*columns, "center", "center_fixed"],
-        "masks": [*columns, "color_stamp_ns"],
-    }
-    for frames, detections, masks in read_together(folder, selected):
-        rows = frame_rows(detections)
-        in_sensor, in_fixed = (numbers_or_nan(detections[n]) for n in selected["detections"][2:])
+    columns = {**CENTERS, "masks": ("topic", "frame", "color_stamp_ns")}
+    for frames, detections, masks in read_together(folder, columns):
         colour_ns = dict(
             zip(keys_of(masks), numbers(masks["color_stamp_ns"]).tolist(), strict=True)
         )
-        for key, stamp in zip(keys_of(frames), numbers(frames["stamp_ns"]).tolist(), strict=True):
+        for key, centers in centers_of(frames, detections):
             stream = streams.setdefault(key[0], _Stream())
-            span = rows.get(key, slice(0, 0))
-            stream.compare(Centers(stamp, in_sensor[span], in_fixed[span]))
+            stream.compare(centers)
             if key in colour_ns:
-                stream.offsets_s.append(abs(colour_ns[key] - stamp) * 1e-9)
+                stream.offsets_s.append(abs(colour_ns[key] - centers.stamp_ns) * 1e-9)
     return streams

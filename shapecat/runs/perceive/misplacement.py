@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from shapecat.arrays import F8
 from shapecat.runs.tables.reading import (
+    Key,
     frame_rows,
     keys_of,
     numbers,
@@ -16,7 +18,15 @@ from shapecat.runs.tables.reading import (
     read_together,
 )
 
-__all__ = ["APART_S", "GAP_S", "Centers", "explain_misplacement", "moved_m"]
+__all__ = [
+    "APART_S",
+    "CENTERS",
+    "GAP_S",
+    "Centers",
+    "centers_of",
+    "explain_misplacement",
+    "moved_m",
+]
 
 APART_S = 0.3
 """Minimum time between two compared frames, so that even a slow camera has moved."""
@@ -31,6 +41,9 @@ _MIN_MOTIONS = 5
 """Minimum number of comparisons on which a warning is based."""
 _WORSE_SHARE = 0.7
 """Minimum fraction of the comparisons in which poses are worse than none."""
+_FRAME = ("topic", "frame")
+CENTERS = {"frames": (*_FRAME, "stamp_ns"), "detections": (*_FRAME, "center", "center_fixed")}
+"""The tables and columns that `centers_of` needs."""
 
 
 class Centers(NamedTuple):
@@ -71,23 +84,12 @@ def _compare(folder: Path) -> dict[str, list[bool]]:
     """
     latest: dict[str, Centers] = {}
     worse: dict[str, list[bool]] = {}
-    columns = ["topic", "frame"]
-    selected = {
-        "frames": [*columns, "stamp_ns"],
-        "detections": [*columns, "center", "center_fixed"],
-    }
-    for frames, detections in read_together(folder, selected):
-        rows = frame_rows(detections)
-        in_sensor, in_fixed = (
-            numbers_or_nan(detections[name]) for name in selected["detections"][2:]
-        )
-        for key, stamp in zip(keys_of(frames), numbers(frames["stamp_ns"]).tolist(), strict=True):
-            span = rows.get(key, slice(0, 0))
-            centers = Centers(stamp, in_sensor[span], in_fixed[span])
+    for frames, detections in read_together(folder, CENTERS):
+        for key, centers in centers_of(frames, detections):
             if not len(centers.fixed) or np.isnan(centers.fixed).any():
                 continue
             previous = latest.setdefault(key[0], centers)
-            seconds = abs(stamp - previous.stamp_ns) * 1e-9
+            seconds = abs(centers.stamp_ns - previous.stamp_ns) * 1e-9
             if seconds < APART_S:
                 continue
             latest[key[0]] = centers
@@ -96,6 +98,15 @@ def _compare(folder: Path) -> dict[str, list[bool]]:
                 farther = moved_m(previous.fixed, centers.fixed) > _WORSE * moved
                 worse.setdefault(key[0], []).append(farther)
     return worse
+
+
+def centers_of(frames: pa.Table, detections: pa.Table) -> Iterator[tuple[Key, Centers]]:
+    """Yield each frame in a part of the tables, and the centres of its objects."""
+    rows = frame_rows(detections)
+    in_sensor, in_fixed = (numbers_or_nan(detections[name]) for name in ("center", "center_fixed"))
+    for key, stamp in zip(keys_of(frames), numbers(frames["stamp_ns"]).tolist(), strict=True):
+        span = rows.get(key, slice(0, 0))
+        yield key, Centers(stamp, in_sensor[span], in_fixed[span])
 
 
 def moved_m(previous: F8, current: F8) -> float:

@@ -17,7 +17,7 @@ from shapecat.runs.tables.reading import (
     topic_codes,
 )
 
-__all__ = ["DetectedFrames", "count_poses", "streams_with_poses"]
+__all__ = ["DetectedFrames", "count_poses", "sensor_poses", "streams_with_poses"]
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class DetectedFrames:
             at = {key: k for k, key in enumerate(keys_of(frames))}
             rows = {key: rows for key, rows in frame_rows(detections).items() if key in at}
             first.append(np.array([count + span.start for span in rows.values()], np.int64))
-            poses.append(_poses(frames, placed)[[at[key] for key in rows]])
+            poses.append(sensor_poses(frames, placed)[[at[key] for key in rows]])
             count += detections.num_rows
         return cls(np.concatenate(first), np.concatenate(poses))
 
@@ -62,7 +62,7 @@ class DetectedFrames:
         return np.asarray(np.searchsorted(self.first, rows, side="right") - 1)
 
 
-def _poses(frames: pa.Table, placed: Collection[str]) -> F8:
+def sensor_poses(frames: pa.Table, placed: Collection[str]) -> F8:
     """Return the poses (f, 3, 4) from sensor to fixed frame, one per row of ``frames``.
 
     They are the identity where the pose is unknown or the topic is not in ``placed``.

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shapecat.arrays import F4, I4
+from shapecat.arrays import F4, I4, Bool
 from shapecat.errors import OutputError
 from shapecat.runs.tables.schemas import FIXED_LISTS, FULL_BOX, TABLES
 
@@ -28,6 +28,7 @@ __all__ = [
     "numbers",
     "numbers_or_nan",
     "opened",
+    "partial_of",
     "read_by_topic",
     "read_row_groups",
     "read_rows",
@@ -221,6 +222,12 @@ def numbers_or_nan(column: pa.ChunkedArray) -> Any:
 def full_boxes_of(table: pa.Table) -> F4:
     """Return the columns `FULL_BOX` as one array (rows, `BOX_WIDTH`); NaN if unknown."""
     return np.hstack([numbers_or_nan(table[name]) for name in FULL_BOX])
+
+
+def partial_of(table: pa.Table) -> Bool:
+    """Return whether each detection is occluded or cut off by the image border, (rows,)."""
+    cut_off, occluded = (table[name].to_numpy() for name in ("touches_border", "occluded"))
+    return np.asarray(cut_off | occluded)
 
 
 @contextmanager
