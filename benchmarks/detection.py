@@ -70,8 +70,7 @@ def _time_all(frames: list[Frame], program: Path | None) -> dict[str, dict[str, 
 
 
 def _unorganized(frame: Frame) -> Frame:
-    points = frame.xyz()
-    points = points[np.isfinite(points[:, 2])]
+    points = frame.finite_xyz()
     return Frame(frame.topic, 0, frame.stamp_ns, 0, frame.frame_id, points=points)
 
 
@@ -88,8 +87,7 @@ def _time_open3d(frames: list[Frame], ups: list[Any]) -> list[float]:
 
     result = []
     for frame, up in zip(frames, ups, strict=True):
-        points = frame.xyz().astype(np.float64)
-        points = points[np.isfinite(points[:, 2])]
+        points = frame.finite_xyz().astype(np.float64)
         result.append(cpu_ms(partial(work, points, up), 1))
     return result
 

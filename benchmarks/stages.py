@@ -14,8 +14,8 @@ from shapecat.arrays import F4, F8
 from shapecat.config import Settings
 from shapecat.description import describe
 from shapecat.detection import detect
-from shapecat.geometry import level_from_sensor, transform
 from shapecat.learning import Categorizer, load_model
+from shapecat.perception import level_points
 from shapecat.surface import reconstruct, voxelize
 
 
@@ -27,9 +27,8 @@ def run(count: int) -> str:
     for frame in simulated_clutter(count):
         scene = detect(frame, settings=settings.detection, rng=np.random.default_rng(0))
         for candidate in scene.candidates[:4]:
-            points = frame.xyz(candidate.indices)
-            level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
-            upright = transform(level, points).astype(np.float32)
+            points, level = level_points(frame, scene, candidate)
+            upright = points.astype(np.float32)
             cloud = voxelize(upright, voxel_m=settings.surface.voxel_m)
             gas = reconstruct(cloud, settings=settings.surface, rng=np.random.default_rng(0))
             if gas is None:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4
+from shapecat.arrays import F4, F8
 from shapecat.cameras.colour import ColourView
 from shapecat.colour.image_masks import find_masks
 from shapecat.completion import ENOUGH_POINTS, complete
@@ -28,7 +28,7 @@ from shapecat.reuse import KeyView, find_repeats, reused, shows_the_same, view_o
 from shapecat.surface import reconstruct, thin
 from shapecat.types import Candidate, Detection, Frame, NeuralGas, Perception, Pose, Scene
 
-__all__ = ["Perceiver", "PerceptionInput", "find_up", "perceive"]
+__all__ = ["Perceiver", "PerceptionInput", "find_up", "level_points", "perceive"]
 
 _ENOUGH_M2 = 0.1
 """Planes with a smaller total area give no up direction: they may be the face of an object."""
@@ -265,6 +265,13 @@ def find_up(frame: Frame, settings: Settings) -> F4 | None:
     return scene.up if sum(plane.area_m2 for plane in scene.planes) >= _ENOUGH_M2 else None
 
 
+def level_points(frame: Frame, scene: Scene, candidate: Candidate) -> tuple[F8, Pose]:
+    """Return the points (n, 3) of a candidate in its level frame, and `level_from_sensor`."""
+    points = frame.xyz(candidate.indices)
+    level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
+    return transform(level, points), level
+
+
 def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:
     """Return a generator seeded by (seed, stamp, object), independent of the order of work."""
     return np.random.default_rng((settings.seed, abs(frame.stamp_ns), item))
@@ -275,9 +282,8 @@ def _describe(
 ) -> _Shape:
     """Move a candidate to the level frame, its support at z = 0; learn and describe its surface."""
     begun = time.perf_counter()
-    points = frame.xyz(candidate.indices)
-    level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
-    cloud = thin(transform(level, points).astype(np.float32), settings=settings.surface)
+    points, level = level_points(frame, scene, candidate)
+    cloud = thin(points.astype(np.float32), settings=settings.surface)
     gas = reconstruct(cloud, settings=settings.surface, rng=rng)
     if gas is None:
         gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int))

@@ -17,7 +17,7 @@ import numpy as np
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.evaluation import View
-from shapecat.geometry import level_from_sensor, transform
+from shapecat.perception import level_points
 from shapecat.recordings import choose_streams, frames, open_recording
 from shapecat.types import Frame, Scene
 
@@ -45,12 +45,9 @@ def detected_views(folder: Path) -> Iterator[View]:
             match = _nearest(scene, item) if image is None else _best_overlap(scene, image, item)
             if match is None:
                 continue
-            candidate = scene.candidates[match]
-            points = frame.xyz(candidate.indices)
-            points = points[np.isfinite(points[:, 0])]
-            level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
+            points, level = level_points(frame, scene, scene.candidates[match])
             name = f"{truth['scene']}_{item.get('label', 0)}"
-            yield View(transform(level, points), level.translation, item["category"], name)
+            yield View(points, level.translation, item["category"], name)
 
 
 def _frames(folder: Path) -> Iterator[tuple[Frame, dict[str, Any]]]:

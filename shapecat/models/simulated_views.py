@@ -32,6 +32,7 @@ from shapecat.models.arrangements import (
 )
 from shapecat.models.fragments import cut_fragment, remove_base
 from shapecat.models.rendered_views import RenderedView, render_view
+from shapecat.perception import level_points
 from shapecat.simulation.camera.render import geometry
 from shapecat.simulation.shapes.mesh import Mesh, moved
 from shapecat.simulation.shapes.stable_poses import StablePose
@@ -245,10 +246,8 @@ def _segment_by_detection(image: RenderedView, scene: Scene, k: int) -> tuple[Vi
 
 def _view_of(image: RenderedView, scene: Scene, candidate: Candidate) -> View:
     """Return the points of a detection in its level frame, without label and instance."""
-    points = image.frame.xyz(candidate.indices)
-    points = points[np.isfinite(points[:, 0])]
-    level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
-    return View(transform(level, points), level.translation, "", "")
+    points, level = level_points(image.frame, scene, candidate)
+    return View(points, level.translation, "", "")
 
 
 def _segment_by_truth(

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from shapecat.arrays import F4, U4
+from shapecat.arrays import F4
 from shapecat.geometry import level_from_sensor, quaternion_from_rotation, transform
 from shapecat.types import Frame, LabelledFrame, LabelledObject, Pose
 
-__all__ = ["finite_points", "support_offset", "upright_cloud", "write_pcd"]
+__all__ = ["support_offset", "upright_cloud", "write_pcd"]
 
 
 def write_pcd(path: Path, points: F4, *, viewpoint: Pose) -> None:
@@ -24,15 +24,6 @@ def write_pcd(path: Path, points: F4, *, viewpoint: Pose) -> None:
         f"POINTS {len(points)}\nDATA binary\n"
     )
     path.write_bytes(header.encode("ascii") + np.ascontiguousarray(points, "<f4").tobytes())
-
-
-def finite_points(frame: Frame, indices: U4 | None = None) -> F4:
-    """Return the points (n, 3) of a frame that have depth, in order, metres, sensor frame.
-
-    ``indices`` selects pixels or points; None selects all.
-    """
-    points = frame.xyz(indices)
-    return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
 def support_offset(item: LabelledObject, up: F4) -> float:
@@ -52,7 +43,7 @@ def upright_cloud(
 
     Points are in metres, with the support at z = 0. The result is None if no point has depth.
     """
-    points = finite_points(frame, item.indices)
+    points = frame.finite_xyz(item.indices)
     if not len(points):
         return None
     level = level_from_sensor(labelled.up, support_offset(item, labelled.up), points)

@@ -96,3 +96,8 @@ class Frame(Record):
         result[:, 1] = (v - camera.cy) / camera.fy * z
         result[:, 2] = z
         return result
+
+    def finite_xyz(self, indices: U4 | None = None) -> F4:
+        """Return the points at ``indices``, by default all, that have depth: (n, 3) as in `xyz`."""
+        points = self.xyz(indices)
+        return np.asarray(points[np.isfinite(points).all(axis=1)])

@@ -21,7 +21,6 @@ from shapecat.cameras.colour import LensCamera
 from shapecat.colour.projection import project, rectified
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
 from shapecat.outputs.colouring import Coloured, ExportedFrame
-from shapecat.outputs.level_clouds import finite_points
 from shapecat.recordings import MessageError
 from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.runs.finished import FinishedRun
@@ -55,7 +54,7 @@ def write_kitti(out: Path, frames: Iterable[ExportedFrame], _finished: FinishedR
             lines = [_label(item, frame, turn, view) for item in labelled.objects]
             (out / "label_2" / f"{number:06d}.txt").write_text("".join(lines), "utf-8")
             (out / "calib" / f"{number:06d}.txt").write_text(_calibration(view, turn), "utf-8")
-            points = finite_points(frame) @ (_VELO_FROM_RECTIFIED @ turn).T
+            points = frame.finite_xyz() @ (_VELO_FROM_RECTIFIED @ turn).T
             rows = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
             rows.astype("<f4").tofile(out / "velodyne" / f"{number:06d}.bin")
             count += len(lines)

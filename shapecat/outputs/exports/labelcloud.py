@@ -15,7 +15,7 @@ from shapecat.arrays import F8
 from shapecat.geometry import box_corners, gravity_rotation, rotation_from_quaternion
 from shapecat.outputs.colouring import ExportedFrame
 from shapecat.outputs.colours import hex_colour
-from shapecat.outputs.level_clouds import finite_points, write_pcd
+from shapecat.outputs.level_clouds import write_pcd
 from shapecat.runs.finished import FinishedRun
 from shapecat.types import LabelledObject, Pose
 
@@ -38,7 +38,7 @@ def write_labelcloud(out: Path, frames: Iterable[ExportedFrame], finished: Finis
     for number, (labelled, frame, _) in enumerate(frames):
         level = gravity_rotation(labelled.up)
         cloud = out / "pointclouds" / f"{number:06d}.pcd"
-        points = finite_points(frame) @ level.T
+        points = frame.finite_xyz() @ level.T
         write_pcd(cloud, points.astype(np.float32), viewpoint=Pose(level, np.zeros(3)))
         for kind in _FORMATS:
             objects = [_described(item, level, kind) for item in labelled.objects]

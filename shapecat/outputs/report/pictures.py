@@ -11,7 +11,7 @@ from shapecat.errors import RecordingError, ShapecatError
 from shapecat.geometry import level_from_sensor, transform
 from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.level_clouds import finite_points, support_offset
+from shapecat.outputs.level_clouds import support_offset
 from shapecat.outputs.report.choosing import Choice
 from shapecat.outputs.report.images import (
     Crop,
@@ -176,7 +176,7 @@ def _points(frame: Frame | None, item: LabelledObject) -> F4:
     """Return at most `MOST_POINTS` points (n, 3) of an object, metres, sensor frame."""
     if frame is None:
         return np.zeros((0, 3), np.float32)
-    return finite_points(frame, item.indices[:: 1 + item.indices.size // MOST_POINTS])
+    return frame.finite_xyz(item.indices[:: 1 + item.indices.size // MOST_POINTS])
 
 
 def _require_unchanged(labelled: LabelledFrame, frame: Frame) -> None:

@@ -10,7 +10,6 @@ import rerun.blueprint as rrb
 
 from shapecat.arrays import F8
 from shapecat.geometry import IDENTITY, transform
-from shapecat.outputs.level_clouds import finite_points
 from shapecat.types import Frame, LabelledFrame, Pose
 
 __all__ = ["Eye", "TrackView", "choose_eye", "lay_out", "send_layout", "stepped_back"]
@@ -100,7 +99,7 @@ def _subject(labelled: LabelledFrame, frame: Frame, pose: Pose) -> tuple[F8, flo
     elif labelled.planes:
         points = np.concatenate([plane.outline for plane in labelled.planes])
     else:
-        points = finite_points(frame)
+        points = frame.finite_xyz()
     if len(points) == 0:
         points = np.zeros((1, 3))
     low, high = points.min(axis=0), points.max(axis=0)

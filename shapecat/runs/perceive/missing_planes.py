@@ -96,15 +96,13 @@ def _distances(frame: Frame) -> F4:
     if frame.depth is not None:
         depths: F4 = frame.depth[frame.depth > 0]
         return depths
-    points = frame.xyz()
     with np.errstate(over="ignore"):
-        distances: F4 = np.linalg.norm(points[np.isfinite(points).all(axis=1)], axis=1)
+        distances: F4 = np.linalg.norm(frame.finite_xyz(), axis=1)
     return distances
 
 
 def _extent_m(frame: Frame) -> float:
     """Return the longest side of the box around all points, along the sensor's axes, metres."""
-    points = frame.xyz()
-    valid = points[np.isfinite(points).all(axis=1)]
+    valid = frame.finite_xyz()
     with np.errstate(over="ignore"):
         return float(np.ptp(valid, axis=0).max()) if len(valid) else 0.0
