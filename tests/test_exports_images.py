@@ -471,8 +471,12 @@ def test_only_earlier_export_is_replaced(run: Path, tmp_path: Path) -> None:
     assert len(read_coco(out)["images"]) == 2
     with pytest.raises(OutputError, match="holds coco, not an earlier yolo export"):
         export_dataset([read_finished(run)], "yolo", out, ImageSelection())
-    with pytest.raises(OutputError, match="holds something else"):
+    with pytest.raises(OutputError, match="is a run; choose another --out"):
         export_dataset([read_finished(run)], "coco", run, ImageSelection())
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "a.txt").touch()
+    with pytest.raises(OutputError, match="holds something else"):
+        export_dataset([read_finished(run)], "coco", tmp_path / "notes", ImageSelection())
 
 
 @pytest.mark.parametrize(

@@ -111,9 +111,7 @@ def export_run(
         or holds something else.
     RecordingError : the recording is missing or unreadable.
     """
-    if (out / "run.json").exists():
-        msg = f"{out}: is a run; choose another --out"
-        raise OutputError(msg)
+    _require_no_run(out)
     finished = replace(finished, common=tuple(categories))
     total = int(finished.info["counts"]["frames"])
     with open_source(finished.info, recording) as source:
@@ -157,9 +155,10 @@ def export_dataset(
     Raises
     ------
     OutputError : a run has no images, no image can be exported, the content of a recording has
-        changed, or ``out`` is not writable or holds something else.
+        changed, or ``out`` is not writable, is a run, or holds something else.
     RecordingError : a recording is missing or unreadable.
     """
+    _require_no_run(out)
     gray = [str(run.folder) for run in runs if not (selection.depth or run.info["color"])]
     if gray:
         msg = f"{', '.join(gray)}: no colour images (--depth exports depth images)"
@@ -220,6 +219,12 @@ def common_categories(runs: Sequence[FinishedRun]) -> tuple[str, ...]:
             msg = f"the runs spell a category {spelled[name.lower()]!r} and {name!r}; relabel one"
             raise OutputError(msg)
     return names
+
+
+def _require_no_run(out: Path) -> None:
+    if (out / "run.json").exists():
+        msg = f"{out}: is a run; choose another --out"
+        raise OutputError(msg)
 
 
 def _staged(
