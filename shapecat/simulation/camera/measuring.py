@@ -30,7 +30,7 @@ def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
     depth : (h, w) float32 metres, 0 where it is missing.
     mesh_ids : (h, w) int16 index of the measured mesh, -1 where there is no depth.
     """
-    inverse, mesh_ids, cosine = _jitter_edges(image, sensor, rng)
+    inverse, mesh_ids, cosine = _displace_edges(image, sensor, rng)
     lost = np.zeros(image.inverse.shape, np.bool_)
     if sensor.stereo_margin_px:
         _drop_margins(inverse, sensor.stereo_margin_px, lost)
@@ -44,7 +44,9 @@ def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
     _drop_random_holes(sensor, rng, lost)
     _drop_border(sensor, lost)
     if sensor.smoothing_px:
-        inverse = _smoothed_surfaces(inverse, sensor.smoothing_px)
+        inverse = _smoothed(inverse, sensor.smoothing_px, _DISCONTINUITY)
+    if sensor.matching_window_px:
+        inverse = _smoothed(inverse, sensor.matching_window_px, _MARGIN_DISCONTINUITY)
     if sensor.blend_px:
         inverse = _blended_edges(inverse, sensor.blend_px)
     depth = np.zeros(inverse.shape, np.float32)
@@ -54,22 +56,23 @@ def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
     return depth, mesh_ids
 
 
-def _jitter_edges(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4]:
-    """Sample the true image at randomly displaced pixels, which makes its edges ragged.
+def _displace_edges(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4]:
+    """Displace the edges of the true image at random; matching windows also round their corners.
 
     Returns the inverse depth (1/m), mesh ids and cosines, all (h, w).
 
     Source: Barron and Malik 2013.
     """
-    inverse = np.array(image.inverse)
-    mesh_ids, cosine = np.array(image.mesh_ids), np.array(image.cosine)
+    given = image.inverse, image.mesh_ids, image.cosine
+    inverse, mesh_ids, cosine = (np.array(part) for part in given)
     if sensor.edge_jitter_px > 0:
         shape, window, size = inverse.shape, sensor.edge_jitter_window, sensor.edge_jitter_px
         across = noise(shape, window, size, rng, smoothings=sensor.smoothings)
-        down = noise(shape, window, size, rng, smoothings=sensor.smoothings)
-        _sample_beside(
-            image.inverse, image.mesh_ids, image.cosine, across, down, inverse, mesh_ids, cosine
-        )
+        if sensor.matching_window_px:
+            _match_windows(*given, sensor.matching_window_px // 2, across, inverse, mesh_ids, cosine)
+        else:
+            down = noise(shape, window, size, rng, smoothings=sensor.smoothings)
+            _sample_beside(*given, across, down, inverse, mesh_ids, cosine)
     return inverse, mesh_ids, cosine
 
 
@@ -132,11 +135,14 @@ def _drop_random_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
         lost[v : v + tall, u : u + wide] = True
 
 
-def _smoothed_surfaces(inverse: F8, width: int) -> F8:
-    """Average inverse depth (h, w) over windows within each surface, which rounds its corners."""
+def _smoothed(inverse: F8, width: int, limit: float) -> F8:
+    """Average inverse depth (h, w) over windows, not beyond discontinuities of more than ``limit``.
+
+    It rounds the edges and corners of surfaces. Windows are ``width`` pixels wide, limits in 1/m.
+    """
     for _ in range(2):  # along the rows, then along the columns
         along = np.zeros_like(inverse)
-        _smooth(inverse, width // 2, along)
+        _smooth(inverse, width // 2, limit, along)
         inverse = np.ascontiguousarray(along.T)
     return inverse
 
@@ -195,6 +201,55 @@ def _sample_beside(
             out[v, u] = inverse[y, x]
             ids_out[v, u] = mesh_ids[y, x]
             cos_out[v, u] = cosine[y, x]
+
+
+@kernel
+def _match_windows(
+    inverse: F8, mesh_ids: I4, cosine: F4, radius: int, shift: F4, out: F8, ids_out: I4, cos_out: F4
+) -> None:
+    """Give each pixel the surface that covers most of the window around it, as stereo matching does.
+
+    ``inverse``, ``mesh_ids`` and ``cosine`` (h, w) are the image; the results go to ``out``,
+    ``ids_out`` and ``cos_out``. The window extends ``radius`` pixels to each side. ``shift`` (h, w)
+    displaces edges, pixels: where it is positive, nearer surfaces grow.
+    """
+    height, width = inverse.shape
+    step = max(radius // 3, 1)
+    reach = radius // step * step
+    samples = np.zeros((2 * (reach // step) + 1) ** 2)
+    near_edge = np.zeros((height, width), np.bool_)
+    for v in range(height):
+        for u in range(width):
+            for y, x in ((v, u + 1), (v + 1, u)):
+                if y < height and x < width:
+                    if abs(inverse[y, x] - inverse[v, u]) >= _DISCONTINUITY:
+                        rows = slice(max(v - reach, 0), v + reach + 1)
+                        near_edge[rows, max(u - reach, 0) : u + reach + 1] = True
+    for v in range(height):
+        for u in range(width):
+            if not near_edge[v, u]:
+                continue
+            n = nearer = farther = 0
+            for y in range(v - reach, v + reach + 1, step):
+                for x in range(u - reach, u + reach + 1, step):
+                    sample = inverse[min(max(y, 0), height - 1), min(max(x, 0), width - 1)]
+                    nearer += sample > inverse[v, u] + _MARGIN_DISCONTINUITY
+                    farther += sample < inverse[v, u] - _MARGIN_DISCONTINUITY
+                    samples[n] = sample
+                    n += 1
+            rank = int((0.5 + shift[v, u] / (2 * reach + 1)) * n)
+            rank = min(max(rank, 0), n - 1)
+            if farther <= rank < n - nearer:
+                continue  # its own surface
+            chosen = np.sort(samples)[rank]
+            least = 1 << 30  # squared distance of the nearest pixel of the chosen surface
+            for y in range(max(v - reach, 0), min(v + reach + 1, height)):
+                for x in range(max(u - reach, 0), min(u + reach + 1, width)):
+                    distance = (y - v) ** 2 + (x - u) ** 2
+                    if distance < least and abs(inverse[y, x] - chosen) < _DISCONTINUITY:
+                        least = distance
+                        out[v, u], ids_out[v, u] = inverse[y, x], mesh_ids[y, x]
+                        cos_out[v, u] = cosine[y, x]
 
 
 @kernel
@@ -308,8 +363,11 @@ def _blend(inverse: F8, radius: int, out: F8) -> None:
 
 
 @kernel
-def _smooth(inverse: F8, radius: int, out: F8) -> None:
-    """Average along rows, up to ``radius`` pixels to each side, within one surface, to ``out``."""
+def _smooth(inverse: F8, radius: int, limit: float, out: F8) -> None:
+    """Average inverse depth (h, w) along rows, up to ``radius`` pixels to each side, to ``out``.
+
+    The average ends at discontinuities of ``limit``, 1/m.
+    """
     height, width = inverse.shape
     for v in range(height):
         for u in range(width):
@@ -318,7 +376,7 @@ def _smooth(inverse: F8, radius: int, out: F8) -> None:
                 last = inverse[v, u]
                 for k in range(1, radius + 1):
                     x = u + way * k
-                    if not 0 <= x < width or abs(inverse[v, x] - last) >= _DISCONTINUITY:
+                    if not 0 <= x < width or abs(inverse[v, x] - last) >= limit:
                         break
                     last = inverse[v, x]
                     total += last

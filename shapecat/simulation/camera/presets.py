@@ -103,6 +103,7 @@ _D435 = Sensor(
     fixed_error_px=90,
     edge_jitter_px=2.0,
     edge_jitter_window=(11, 11),
+    matching_window_px=11,
     shadow_m=(0.05,),
     shadow_fill_px=2.0,
     grazing_cosine=0.15,
@@ -111,7 +112,6 @@ _D435 = Sensor(
     holes=0.004,
     hole_px=8,
     blend_px=3,
-    smoothing_px=11,
     border_px=(12, 0, 0, 0),
 )
 """Intel D435 without filters: noise of 0.07 px of disparity at a focal length of 425 px and a
@@ -144,12 +144,12 @@ _D455 = replace(
     fixed_error_px=130,
     edge_jitter_px=2.6,
     edge_jitter_window=(15, 15),
+    matching_window_px=17,
     shadow_m=(0.095,),
     shadow_fill_px=3.0,
     stereo_margin_px=8,
     hole_px=12,
     blend_px=5,
-    smoothing_px=17,
     border_px=(30, 0, 0, 0),
 )
 """Intel D455: disparity noise of 0.15 px, focal length of 640 px, baseline of 95 mm; source as for

@@ -29,6 +29,8 @@ class Sensor:
     device : seed of the fixed error and of the objects' reflectance.
     edge_jitter_px : standard deviation of the displacement of depth edges, pixels.
     edge_jitter_window : (across, down) correlation window of this displacement, pixels.
+    matching_window_px : width of the window of stereo matching, pixels, which rounds the corners of
+        outlines, and edges and small steps within them; 0 for none.
     shadow_m : x positions of the light source and of other cameras, relative to this one, metres;
         depth is missing at points that are hidden from one of them.
     shadow_fill_px : mean width by which these shadows are narrower than geometry predicts, pixels.
@@ -59,6 +61,7 @@ class Sensor:
     device: int = 1
     edge_jitter_px: float = 0.0
     edge_jitter_window: tuple[int, int] = (1, 1)
+    matching_window_px: int = 0
     shadow_m: tuple[float, ...] = ()
     shadow_fill_px: float = 0.0
     grazing_cosine: float = 0.0
@@ -104,6 +107,7 @@ def resized(sensor: Sensor, scale: float) -> Sensor:
         noise_window=_scaled(sensor.noise_window, scale),
         edge_jitter_window=_scaled(sensor.edge_jitter_window, scale),
         edge_jitter_px=sensor.edge_jitter_px * scale,
+        matching_window_px=round(sensor.matching_window_px * scale),
         fixed_error_px=max(round(sensor.fixed_error_px * scale), 2),
         shadow_fill_px=sensor.shadow_fill_px * scale,
         stereo_margin_px=round(sensor.stereo_margin_px * scale),

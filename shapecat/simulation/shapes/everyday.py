@@ -10,7 +10,7 @@ from shapecat.simulation.shapes.parts import ellipsoid, placed, rod
 from shapecat.simulation.shapes.primitives import extrude, rounded_box, smooth_path, tube
 from shapecat.simulation.shapes.randomness import log_uniform
 
-__all__ = ["EVERYDAY"]
+__all__ = ["EVERYDAY", "any_side"]
 
 
 def _cutlery(rng: Generator) -> Mesh:
@@ -85,7 +85,7 @@ def _gadget(rng: Generator) -> Mesh:
     if rng.random() < 0.3:  # a lens or a plug at its side
         lens = rod(float(size[2]) * rng.uniform(0.3, 1.2), float(size[2]) * rng.uniform(0.2, 0.45))
         parts.append(placed(lens, [0, size[1] / 2, size[2] / 2], about="x", degrees=-90))
-    return _any_side(join(parts), rng)
+    return any_side(join(parts), rng)
 
 
 _GADGET = ((0.05, 0.2), (0.03, 0.12), (0.012, 0.07))
@@ -137,10 +137,10 @@ def _fixture(rng: Generator) -> Mesh:
     if rng.random() < 0.4:
         rib = extrude([[0, 0], [0.4 * long, 0], [0, 0.6 * other]], thick)
         parts.append(placed(rib, [0, thick / 2, thick], about="x", degrees=90))
-    return _any_side(join(parts), rng)
+    return any_side(join(parts), rng)
 
 
-def _any_side(mesh: Mesh, rng: Generator) -> Mesh:
+def any_side(mesh: Mesh, rng: Generator) -> Mesh:
     """Turn a mesh so that it stands on a side chosen at random."""
     about, degrees = str(rng.choice(["x", "y"])), float(rng.choice([0, 0, 90, 180]))
     return standing(placed(mesh, about=about, degrees=degrees))

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.random import Generator
 
 from shapecat.arrays import F8
-from shapecat.simulation.shapes.everyday import EVERYDAY
+from shapecat.simulation.shapes.everyday import EVERYDAY, any_side
 from shapecat.simulation.shapes.mesh import Mesh, join, moved, standing
-from shapecat.simulation.shapes.parts import ellipsoid, rod
+from shapecat.simulation.shapes.parts import ellipsoid, placed, rod
 from shapecat.simulation.shapes.primitives import extrude, lathe, rounded_box, smooth_path, tube
 from shapecat.simulation.shapes.randomness import log_uniform, random_rotation
 from shapecat.types import Pose
@@ -123,6 +123,30 @@ def _frame(rng: Generator) -> Mesh:
     return join(parts)
 
 
+def _block(rng: Generator) -> Mesh:
+    """Return a building block that is no box: a prism, part of a disc, cross, or an L, T or bridge."""
+    size, kind = log_uniform(rng, 0.018, 0.05), rng.integers(4)
+    thick = size * log_uniform(rng, 0.5, 2.0)
+    if kind == 0:
+        angle = np.arange(corners := int(rng.choice([3, 5]))) * (2 * np.pi / corners)
+        outline = [1, rng.uniform(0.7, 1.3)] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    elif kind == 1:
+        angle = np.linspace(0, np.pi * rng.choice([0.5, 1.0]), 16)
+        outline = np.stack([np.append(np.cos(angle), 0), np.append(np.sin(angle), 0)], -1)
+    elif kind == 2:
+        a = rng.uniform(0.25, 0.5)
+        quarter: F8 = np.array([[1, -a], [1, a], [a, a]])
+        turns = [np.array([[c, -s], [s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+        outline = np.concatenate([quarter @ turn.T for turn in turns])
+    else:
+        bar = rounded_box(2 * size * np.array([1, rng.uniform(0.25, 0.5), thick / size / 2]))
+        leg = rounded_box(2 * size * np.array([rng.uniform(0.25, 0.5), 1, thick / size / 2]))
+        ends = [[[-0.7, 0.6]], [[0, 0.6]], [[-0.7, 0.6], [0.7, 0.6]]][int(rng.integers(3))]
+        legs = [placed(leg, [x * size, y * size, 0]) for x, y in ends]
+        return any_side(join([bar, *legs]), rng)
+    return any_side(extrude(size * outline, thick), rng)
+
+
 PROCEDURAL: dict[str, Callable[[Generator], Mesh]] = {
     "assembly": _assembly,
     "bent_rod": _bent_rod,
@@ -131,6 +155,7 @@ PROCEDURAL: dict[str, Callable[[Generator], Mesh]] = {
     "turned": _turned,
     "branched": _branched,
     "frame": _frame,
+    "block": _block,
     **EVERYDAY,
 }
 """For each family of objects, the function that makes a random one."""
