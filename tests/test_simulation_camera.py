@@ -265,6 +265,52 @@ def test_stereo_depth_is_missing_around_near_surfaces() -> None:
     assert (depth[~margin] > 0).all()
 
 
+def small_box_from_above(height: float) -> Image:
+    """Return an image of a box on a plane 0.6 m away, 60 x 48 px, from straight above."""
+    box = rounded_box([0.0687, 0.055, height])  # 525 px at the distance of its top
+    scale = (0.6 - height) / 0.6
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+    ground = Pose(np.eye(3), np.zeros(3))
+    box = Mesh(box.vertices * [scale, scale, 1.0], box.triangles)
+    return render(geometry([(big_quad(0.0), ground), (box, ground)]), IDEAL.camera, pose)
+
+
+def test_matching_windows_round_the_corners_of_outlines() -> None:
+    """Blocks with sharp corners would be easier to tell from cans than real ones.
+
+    A pixel belongs to the surface that covers most of its window: on a diagonal, the edge recedes
+    until a quarter of the window is left on each side; along the sides, nothing changes.
+    """
+    plain = dataclasses.replace(IDEAL, matching_window_px=21)
+    image = small_box_from_above(0.1)
+    depth, mesh_ids = measure(image, plain, np.random.default_rng(0))
+    box = mesh_ids == 1
+    rows, columns = np.flatnonzero(box.any(axis=1)), np.flatnonzero(box.any(axis=0))
+    corner = np.diagonal(box[rows[0] :, columns[0] :])
+    lost = (image.mesh_ids == 1) & ~box
+
+    assert (len(rows), len(columns)) == (48, 60)
+    assert 3 <= corner.argmax() <= 6  # (1 - 1 / sqrt(2)) * 10.5 = 3.1, at a resolution of 3 px
+    assert (box & (image.mesh_ids != 1)).sum() <= 8
+    assert 60 < lost.sum() < 200
+    np.testing.assert_allclose(depth[lost], 0.6, atol=0.01)
+
+
+@pytest.mark.parametrize(("height", "wide"), [(0.015, (7, 12)), (0.1, (0, 2))])
+def test_matching_windows_blend_small_steps_alone(height: float, wide: tuple[int, int]) -> None:
+    """At a step of a few centimetres, real depth changes over the width of a window, without holes.
+
+    Larger steps stay sharp; the pixels between would be flying pixels.
+    """
+    plain = dataclasses.replace(IDEAL, matching_window_px=13)
+    depth, _ = measure(small_box_from_above(height), plain, np.random.default_rng(0))
+    row = 0.6 - depth[240, 320:400]
+    between = (row > 0.1 * height) & (row < 0.9 * height)
+
+    assert wide[0] <= between.sum() <= wide[1]
+    assert (depth > 0).all()
+
+
 def test_table_at_low_angle_has_no_missing_margins() -> None:
     """Its inverse depth changes as much within a few pixels as at an outline."""
     pose = looking_at(np.array([0, 0, 0.35]), np.array([0, 1.0, 0.2]))
@@ -322,7 +368,7 @@ def test_resized_sensor_has_windows_of_same_angle() -> None:
     half = resized(PRESETS["d455"], 0.5)
 
     assert half.camera.width == 640
-    assert (half.stereo_margin_px, half.hole_px, half.smoothing_px) == (4, 6, 8)
+    assert (half.stereo_margin_px, half.hole_px, half.matching_window_px) == (4, 6, 8)
     assert half.noise_window == (8, 6)
     assert resized(IDEAL, 0.5).stereo_margin_px == 0
 

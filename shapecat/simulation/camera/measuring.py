@@ -65,11 +65,13 @@ def _displace_edges(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I
     """
     given = image.inverse, image.mesh_ids, image.cosine
     inverse, mesh_ids, cosine = (np.array(part) for part in given)
-    if sensor.edge_jitter_px > 0:
+    if sensor.edge_jitter_px > 0 or sensor.matching_window_px:
         shape, window, size = inverse.shape, sensor.edge_jitter_window, sensor.edge_jitter_px
         across = noise(shape, window, size, rng, smoothings=sensor.smoothings)
         if sensor.matching_window_px:
-            _match_windows(*given, sensor.matching_window_px // 2, across, inverse, mesh_ids, cosine)
+            _match_windows(
+                *given, sensor.matching_window_px // 2, across, inverse, mesh_ids, cosine
+            )
         else:
             down = noise(shape, window, size, rng, smoothings=sensor.smoothings)
             _sample_beside(*given, across, down, inverse, mesh_ids, cosine)
