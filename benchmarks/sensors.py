@@ -1,4 +1,4 @@
-"""Similarity of simulated and real sensors: roughness of planes, width of edges, holes.
+"""Similarity of simulated and real sensors: roughness of planes, width of edges and steps, holes.
 
     python -m benchmarks.sensors --real FOLDER --real FOLDER --picture sensors.png
 
@@ -8,6 +8,7 @@ best.
 """
 
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +29,14 @@ QUIETEST = 0.25
 """Quantile of the windows that are treated as planes; noisier windows contain objects."""
 JUMP_M, EDGE_PX = 0.06, 12
 """Edges are depth steps of at least this height within this number of pixels."""
-HEAD = ("sensor", "frames", "distance, m", "roughness, 1/m", "warp, 1/m", "edge, px", "holes")
+STEPS, STEP_PX = (0.03, 0.07), 12
+"""Small steps of the inverse depth, 1/m, and the number of pixels within which they are."""
+STRAIGHT = 0.0006
+"""Maximum change of the slope of the inverse depth on both sides of a small step, 1/m per pixel."""
+HEAD = (
+    *("sensor", "frames", "distance, m", "roughness, 1/m", "warp, 1/m"),
+    *("edge, px", "step, px", "holes"),
+)
 
 
 class Figures(NamedTuple):
@@ -38,7 +46,7 @@ class Figures(NamedTuple):
     ----------
     distance : median depth, metres.
     roughness, warp : standard deviation from planes in small and large windows, 1/m.
-    edge : width of edges, pixels of an image 640 pixels wide.
+    edge, step : width of edges and of small steps, pixels of an image 640 pixels wide.
     holes : fraction of pixels without depth inside the area with depth.
     """
 
@@ -46,6 +54,7 @@ class Figures(NamedTuple):
     roughness: float
     warp: float
     edge: float
+    step: float
     holes: float
 
 
@@ -55,11 +64,14 @@ def measure_frame(depth: Array) -> Figures:
     inverse = np.divide(1.0, depth, where=depth > 0, out=np.zeros(depth.shape))
     errors = [_roughness(inverse, max(round(w * scale), 6)) for w in WINDOWS.values()]
     edge = _edge_width(depth, max(round(EDGE_PX * scale), 4)) / scale
+    across = max(round(STEP_PX * scale), 4)
+    step = np.concatenate([_step_widths(image, across) for image in (inverse, inverse.T)]) / scale
     seen = depth > 0
     rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     inside = seen[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     distance, holes = float(np.median(depth[seen])), float(1 - inside.mean())
-    return Figures(distance, errors[0], errors[1], edge, holes)
+    middle = float(np.median(step)) if step.size else float("nan")
+    return Figures(distance, errors[0], errors[1], edge, middle, holes)
 
 
 def _roughness(inverse: Array, width: int) -> float:
@@ -87,6 +99,29 @@ def _edge_width(depth: Array, width: int) -> float:
         off = np.minimum(np.abs(middle - near), np.abs(middle - far)) > JUMP_M / 4
         between += off & (middle > 0)
     return float(between[step].mean()) if step.any() else float("nan")
+
+
+def _step_widths(inverse: Array, width: int) -> Array:
+    """Return the widths (n,) of small steps along rows, from 10 to 90 % of each, pixels.
+
+    A step is between two straight pieces of surface, each ``width`` pixels long, ``width`` pixels
+    apart; it has no holes. ``inverse`` (h, w) is the inverse depth, 1/m, 0 without depth.
+    """
+    n, half = inverse.shape[1] - 3 * width, width // 2
+    at = [inverse[:, k : k + n] for k in (0, half, width, 2 * width, 2 * width + half, 3 * width)]
+    slopes = [(b - a) / half for a, b in pairwise(at)]
+    step = at[3] - at[2] - (slopes[1] + slopes[3]) / 2 * width
+    holds = np.min(at, axis=0) > 0
+    for a, b in ((0, 1), (3, 4)):
+        holds &= np.abs(slopes[a] - slopes[b]) < STRAIGHT
+    rows, columns = np.nonzero(holds & (np.abs(step) > STEPS[0]) & (np.abs(step) < STEPS[1]))
+    k = np.arange(width + 1)
+    part = inverse[rows[:, None], columns[:, None] + width + k]
+    left, right = (slopes[i][rows, columns][:, None] for i in (1, 3))
+    low, high = part[:, :1] + left * k, part[:, -1:] - right * (width - k)
+    share = np.divide(part - low, high - low, where=high != low, out=np.zeros(part.shape))
+    widths = ((share > 0.1) & (share < 0.9)).sum(axis=1)
+    return np.asarray(widths[(part > 0).all(axis=1)])
 
 
 def _simulated(name: str, first: int, count: int) -> Iterator[Figures]:
