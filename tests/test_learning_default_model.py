@@ -100,7 +100,7 @@ def test_new_simulated_objects_are_recognised(model: Categorizer) -> None:
     whole = (data.source != "fragment") & (data.visible > 0.7) & (data.resting_pose == "upright")
     report = evaluate(data.views.where(whole & (data.views.distances < _NEAR_M)), model)
 
-    assert report.n > 100
+    assert report.n > 90
     assert report.accuracy is not None
     assert report.accuracy > 0.95  # 0.976
 

@@ -39,8 +39,8 @@ partial views of known categories.
 
 On simulated objects the confidence is calibrated: of the objects with a confidence of 0.8, about
 80 % have the right category. In real clutter it is too high, mostly for shapes of no category.
-In real recordings with labels, 45 detections of a known category had a confidence of at least 0.9:
-30 were right, and 14 of the 15 others were *unknown* shapes.
+In real recordings with labels, 43 detections of a known category had a confidence of at least 0.9:
+29 were right, and the 14 others were *unknown* shapes.
 
 ## The worst mistakes
 
