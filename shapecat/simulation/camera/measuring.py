@@ -5,16 +5,18 @@ from numpy.random import Generator
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.jit import kernel
+from shapecat.simulation.camera.edges import (
+    DISCONTINUITY,
+    MARGIN_DISCONTINUITY,
+    blended_edges,
+    displace_edges,
+    drop_margins,
+)
 from shapecat.simulation.camera.noise import fixed_error, noise
 from shapecat.simulation.camera.render import Image
 from shapecat.simulation.camera.sensors import Sensor
 
 __all__ = ["measure"]
-
-_DISCONTINUITY = 0.03
-"""Minimum discontinuity of the inverse depth between two surfaces, 1/m."""
-_MARGIN_DISCONTINUITY = 0.07
-"""Minimum discontinuity of the inverse depth beside which stereo matching fails, 1/m."""
 
 
 def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
@@ -30,10 +32,10 @@ def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
     depth : (h, w) float32 metres, 0 where it is missing.
     mesh_ids : (h, w) int16 index of the measured mesh, -1 where there is no depth.
     """
-    inverse, mesh_ids, cosine = _displace_edges(image, sensor, rng)
+    inverse, mesh_ids, cosine = displace_edges(image, sensor, rng)
     lost = np.zeros(image.inverse.shape, np.bool_)
     if sensor.stereo_margin_px:
-        _drop_margins(inverse, sensor.stereo_margin_px, lost)
+        drop_margins(inverse, sensor.stereo_margin_px, lost)
     for place in sensor.shadow_m:
         _cast_shadow(inverse, place * sensor.camera.fx, lost)
     if sensor.shadow_fill_px > 0:
@@ -44,38 +46,16 @@ def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
     _drop_random_holes(sensor, rng, lost)
     _drop_border(sensor, lost)
     if sensor.smoothing_px:
-        inverse = _smoothed(inverse, sensor.smoothing_px, _DISCONTINUITY)
+        inverse = _smoothed(inverse, sensor.smoothing_px, DISCONTINUITY)
     if sensor.matching_window_px:
-        inverse = _smoothed(inverse, sensor.matching_window_px, _MARGIN_DISCONTINUITY)
+        inverse = _smoothed(inverse, sensor.matching_window_px, MARGIN_DISCONTINUITY)
     if sensor.blend_px:
-        inverse = _blended_edges(inverse, sensor.blend_px)
+        inverse = blended_edges(inverse, sensor.blend_px)
     depth = np.zeros(inverse.shape, np.float32)
     error = _inverse_depth_error(inverse, sensor, rng)
     limits = np.array([sensor.step, sensor.nearest_m, sensor.farthest_m])
     _write_depth(inverse, error, lost, limits, depth, mesh_ids)
     return depth, mesh_ids
-
-
-def _displace_edges(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4]:
-    """Displace the edges of the true image at random; matching windows also round their corners.
-
-    Returns the inverse depth (1/m), mesh ids and cosines, all (h, w).
-
-    Source: Barron and Malik 2013.
-    """
-    given = image.inverse, image.mesh_ids, image.cosine
-    inverse, mesh_ids, cosine = (np.array(part) for part in given)
-    if sensor.edge_jitter_px > 0 or sensor.matching_window_px:
-        shape, window, size = inverse.shape, sensor.edge_jitter_window, sensor.edge_jitter_px
-        across = noise(shape, window, size, rng, smoothings=sensor.smoothings)
-        if sensor.matching_window_px:
-            _match_windows(
-                *given, sensor.matching_window_px // 2, across, inverse, mesh_ids, cosine
-            )
-        else:
-            down = noise(shape, window, size, rng, smoothings=sensor.smoothings)
-            _sample_beside(*given, across, down, inverse, mesh_ids, cosine)
-    return inverse, mesh_ids, cosine
 
 
 def _inverse_depth_error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
@@ -149,16 +129,6 @@ def _smoothed(inverse: F8, width: int, limit: float) -> F8:
     return inverse
 
 
-def _blended_edges(inverse: F8, width: int) -> F8:
-    """Mix near and far inverse depth at edges, as stereo windows and smoothing filters do.
-
-    The inverse depth and the result are (h, w), 1/m; the window is ``width`` pixels wide.
-    """
-    result = np.zeros_like(inverse)
-    _blend(inverse, width // 2, result)
-    return result
-
-
 @kernel
 def _write_depth(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, mesh_ids: I4) -> None:
     """Add the error, quantize, and write the depth, metres; without depth, the mesh id becomes -1.
@@ -183,98 +153,6 @@ def _write_depth(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, mesh
 
 
 @kernel
-def _sample_beside(
-    inverse: F8, mesh_ids: I4, cosine: F4, across: F4, down: F4, out: F8, ids_out: I4, cos_out: F4
-) -> None:
-    """Sample the image at displaced pixels into ``out``, ``ids_out`` and ``cos_out``.
-
-    ``inverse``, ``mesh_ids`` and ``cosine`` (h, w) are the image; ``across`` and ``down`` (h, w)
-    are the displacements, pixels.
-    """
-    height, width = inverse.shape
-    for v in range(height):
-        for u in range(width):
-            x, y = int(np.floor(u + across[v, u] + 0.5)), int(np.floor(v + down[v, u] + 0.5))
-            x, y = min(max(x, 0), width - 1), min(max(y, 0), height - 1)
-            neighbour, center = inverse[y, x], inverse[v, u]
-            # Only edges move; on a surface, the pixel keeps its own true depth.
-            if abs(neighbour - center) < _DISCONTINUITY and mesh_ids[y, x] == mesh_ids[v, u]:
-                x, y = u, v
-            out[v, u] = inverse[y, x]
-            ids_out[v, u] = mesh_ids[y, x]
-            cos_out[v, u] = cosine[y, x]
-
-
-@kernel
-def _match_windows(
-    inverse: F8, mesh_ids: I4, cosine: F4, radius: int, shift: F4, out: F8, ids_out: I4, cos_out: F4
-) -> None:
-    """Give each pixel the surface that covers most of the window around it, as stereo matching does.
-
-    ``inverse``, ``mesh_ids`` and ``cosine`` (h, w) are the image; the results go to ``out``,
-    ``ids_out`` and ``cos_out``. The window extends ``radius`` pixels to each side. ``shift`` (h, w)
-    displaces edges, pixels: where it is positive, nearer surfaces grow.
-    """
-    height, width = inverse.shape
-    step = max(radius // 3, 1)
-    reach = radius // step * step
-    samples = np.zeros((2 * (reach // step) + 1) ** 2)
-    near_edge = np.zeros((height, width), np.bool_)
-    for v in range(height):
-        for u in range(width):
-            for y, x in ((v, u + 1), (v + 1, u)):
-                if y < height and x < width:
-                    if abs(inverse[y, x] - inverse[v, u]) >= _DISCONTINUITY:
-                        rows = slice(max(v - reach, 0), v + reach + 1)
-                        near_edge[rows, max(u - reach, 0) : u + reach + 1] = True
-    for v in range(height):
-        for u in range(width):
-            if not near_edge[v, u]:
-                continue
-            n = nearer = farther = 0
-            for y in range(v - reach, v + reach + 1, step):
-                for x in range(u - reach, u + reach + 1, step):
-                    sample = inverse[min(max(y, 0), height - 1), min(max(x, 0), width - 1)]
-                    nearer += sample > inverse[v, u] + _MARGIN_DISCONTINUITY
-                    farther += sample < inverse[v, u] - _MARGIN_DISCONTINUITY
-                    samples[n] = sample
-                    n += 1
-            rank = int((0.5 + shift[v, u] / (2 * reach + 1)) * n)
-            rank = min(max(rank, 0), n - 1)
-            if farther <= rank < n - nearer:
-                continue  # its own surface
-            chosen = np.sort(samples)[rank]
-            least = 1 << 30  # squared distance of the nearest pixel of the chosen surface
-            for y in range(max(v - reach, 0), min(v + reach + 1, height)):
-                for x in range(max(u - reach, 0), min(u + reach + 1, width)):
-                    distance = (y - v) ** 2 + (x - u) ** 2
-                    if distance < least and abs(inverse[y, x] - chosen) < _DISCONTINUITY:
-                        least = distance
-                        out[v, u], ids_out[v, u] = inverse[y, x], mesh_ids[y, x]
-                        cos_out[v, u] = cosine[y, x]
-
-
-@kernel
-def _drop_margins(inverse: F8, width: int, lost: Bool) -> None:
-    """Mark as ``lost`` (h, w) pixels up to ``width`` rows and columns beside a nearer surface."""
-    height, columns = inverse.shape
-    nearest = np.zeros(inverse.shape)
-    for v in range(height):
-        for u in range(columns):
-            best = inverse[v, u]
-            for x in range(max(u - width, 0), min(u + width + 1, columns)):
-                best = max(best, inverse[v, x])
-            nearest[v, u] = best
-    for v in range(height):
-        first, last = max(v - width, 0), min(v + width + 1, height)
-        for u in range(columns):
-            for y in range(first, last):
-                if nearest[y, u] > inverse[v, u] + _MARGIN_DISCONTINUITY:
-                    lost[v, u] = True
-                    break
-
-
-@kernel
 def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
     """Mark pixels whose points are occluded from a second viewpoint beside the camera.
 
@@ -292,7 +170,7 @@ def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
             start = int(np.floor(x + 0.5))
             end = start
             # The same surface continues.
-            if u + 1 < width and abs(inverse[v, u + 1] - inverse_depth) < _DISCONTINUITY:
+            if u + 1 < width and abs(inverse[v, u + 1] - inverse_depth) < DISCONTINUITY:
                 end = max(start, int(np.floor(u + 1 - shift * inverse[v, u + 1] + 0.5)) - 1)
             for cell in range(start, end + 1):
                 at = cell + margin
@@ -301,7 +179,7 @@ def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
         for u in range(width):
             inverse_depth = inverse[v, u]
             at = int(np.floor(u - shift * inverse_depth + 0.5)) + margin
-            if 0 <= at < nearest.size and nearest[at] > inverse_depth + _DISCONTINUITY:
+            if 0 <= at < nearest.size and nearest[at] > inverse_depth + DISCONTINUITY:
                 shadow[v, u] = True
 
 
@@ -334,34 +212,6 @@ def _fill_shadow(inverse: F8, mesh_ids: I4, shadow: Bool, growth_px: I4) -> None
                     inverse[v, k], mesh_ids[v, k] = after, mesh_ids[v, end]
                     shadow[v, k] = False
             u = end
-
-
-@kernel
-def _blend(inverse: F8, radius: int, out: F8) -> None:
-    """Average the inverse depth (h, w) over a window at edges along rows; write it to ``out``.
-
-    The window extends ``radius`` pixels to each side. Elsewhere, the inverse depth is copied.
-    """
-    height, width = inverse.shape
-    for v in range(height):
-        for u in range(width):
-            center = inverse[v, u]
-            out[v, u] = center
-            if not (radius <= u < width - radius and radius <= v < height - radius) or center <= 0:
-                continue
-            edge = False
-            for k in range(1, radius + 1):
-                edge = edge or abs(inverse[v, u - k] - center) > _DISCONTINUITY
-                edge = edge or abs(inverse[v, u + k] - center) > _DISCONTINUITY
-            if not edge:
-                continue
-            total, count = 0.0, 0
-            for y in range(v - radius, v + radius + 1):
-                for x in range(u - radius, u + radius + 1):
-                    if inverse[y, x] > 0:
-                        total += inverse[y, x]
-                        count += 1
-            out[v, u] = total / count
 
 
 @kernel

@@ -124,12 +124,13 @@ def _frame(rng: Generator) -> Mesh:
 
 
 def _block(rng: Generator) -> Mesh:
-    """Return a building block that is no box: a prism, part of a disc, cross, or an L, T or bridge."""
+    """Return a building block that is no box: a prism, part of a disc, cross, L, T or bridge."""
     size, kind = log_uniform(rng, 0.018, 0.05), rng.integers(4)
     thick = size * log_uniform(rng, 0.5, 2.0)
     if kind == 0:
-        angle = np.arange(corners := int(rng.choice([3, 5]))) * (2 * np.pi / corners)
-        outline = [1, rng.uniform(0.7, 1.3)] * np.stack([np.cos(angle), np.sin(angle)], -1)
+        corners = int(rng.choice([3, 5]))
+        angle = np.arange(corners) * (2 * np.pi / corners)
+        outline: F8 = np.stack([np.cos(angle), np.sin(angle)], -1) * [1, rng.uniform(0.7, 1.3)]
     elif kind == 1:
         angle = np.linspace(0, np.pi * rng.choice([0.5, 1.0]), 16)
         outline = np.stack([np.append(np.cos(angle), 0), np.append(np.sin(angle), 0)], -1)
