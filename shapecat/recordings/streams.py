@@ -311,8 +311,7 @@ def _nearest(image: str, infos: Sequence[str]) -> str | None:
         suffix = re.sub("[^/]*_to_", "", "/".join(parts[length:]))  # depth_to_color is as color
         own_names = (f"{word}_camera_info" for word in re.split("[/_]", suffix))
         for name in (*own_names, *_INFO_NAMES):
-            sibling = "/".join([*parts[:length], name])
-            if sibling in infos:
+            if (sibling := "/".join([*parts[:length], name])) in infos:
                 return sibling
     return None
 
@@ -328,5 +327,4 @@ def _frame_of(recording: Recording, topic: str) -> str:
 
 _INFO_NAMES = ("camera_info", "info/camera_info", "calibration")
 """Names of calibration topics in ROS, in the RealSense viewer and in Foxglove."""
-
 _PROBES = {CLOUD: _probe_cloud, IMAGE: _probe_image, COMPRESSED: _probe_compressed}

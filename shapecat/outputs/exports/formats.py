@@ -227,11 +227,7 @@ def _require_no_run(out: Path) -> None:
         raise OutputError(msg)
 
 
-def _staged(
-    target: Path,
-    about: Mapping[str, Any],
-    write: Callable[[Path], int],
-) -> int:
+def _staged(target: Path, about: Mapping[str, Any], write: Callable[[Path], int]) -> int:
     """Let ``write`` fill ``target``, which appears when complete; return the number of objects."""
     recover(target, _made_by_export)
     _require_own(target, about)
@@ -307,8 +303,7 @@ def _require_own(target: Path, about: Mapping[str, Any]) -> None:
         msg = f"{target}: holds the {format} export of another time range; choose another --out"
         raise OutputError(msg)
     exported = (target / _MARK).stat().st_mtime_ns
-    later = [path for path in target.rglob("*") if path.lstat().st_mtime_ns > exported]
-    if later:
+    if later := [path for path in target.rglob("*") if path.lstat().st_mtime_ns > exported]:
         changed = min(later, key=lambda path: (path.is_dir(), path))
         msg = f"{changed}: was changed after the export; choose another --out, or move it away"
         raise OutputError(msg)

@@ -1,8 +1,9 @@
 """Presets of depth cameras: their intrinsics and error models.
 
 The parameters of the Kinect and the RealSense D435 are fitted to real images of tables with
-objects, and so are the low-frequency error, margins and smoothing of the D4xx and the SR300. All
-other parameters follow data sheets and the cited measurements.
+objects, and so are the low-frequency error, margins and smoothing of the D4xx and the SR300, and
+the matching windows of the D4xx. All other parameters follow data sheets and the cited
+measurements.
 """
 
 from dataclasses import replace
