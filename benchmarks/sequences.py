@@ -70,6 +70,8 @@ class View:
     ----------
     track : kind of the sequence, seed, and number of the track.
     truth : true category.
+    undecidable : as in `Object`.
+    partial : whether the image border or another object cuts off the view.
     single, final : category of the single view, and final category of the track.
     """
 

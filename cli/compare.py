@@ -58,7 +58,7 @@ def compare(
 
 
 def _print(comparison: "Comparison", rows: Sequence[Sequence[str]]) -> None:
-    """Print the metrics, then the number of differences of each kind."""
+    """Print ``rows`` of metric, value and meaning, then the number of differences of each kind."""
     click.echo(f"{comparison.run} compared with {comparison.reference} ({comparison.kind})\n")
     print_table(("metric", "value", "meaning"), rows)
     click.echo(f"\n{_describe_differences(comparison.as_dict()['differences'])}")

@@ -58,7 +58,7 @@ _NO_VAL = (
 @click.option(
     "--corrected-only",
     is_flag=True,
-    help="coco, yolo: only objects whose track a person has labelled are reliable.",
+    help="coco, yolo: only objects whose track a person has labelled count as reliable.",
 )
 @click.option(
     "--depth", is_flag=True, help="coco, yolo: export 16-bit depth images instead of colour images."

@@ -78,8 +78,8 @@ if TYPE_CHECKING:
 @click.option(
     "--shard",
     metavar="I/N",
-    help="Process only part I of N, for job arrays. I counts from 1 to N, or from 0 to N-1; parts "
-    "0 and N are the same.",
+    help="Process only part I of N, for job arrays. I is 1 to N, or 0 to N-1; 0 and N are "
+    "the same part.",
 )
 @choice_option(
     "--progress",
@@ -140,8 +140,8 @@ def process(
 
     Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a folder with
     recordings, or a URL. The results of lab.mcap go to OUT/lab: tables, annotated.mcap for
-    Foxglove, and review.rrd for Rerun. If recordings have the same name, the name of the folder is
-    put in front of it, as in OUT/monday_lab; if these names are equal, too, a number is appended.
+    Foxglove, and review.rrd for Rerun. If recordings have the same name, the name of the folder
+    comes first, as in OUT/monday_lab; if these names are equal, too, a number is appended.
     For several recordings, OUT/manifest.jsonl records the state of each. To resume after an
     interruption, run the same command again.
 

@@ -327,7 +327,7 @@ class Fragile(Executor):
         self._folder = folder
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Run the call at once."""
+        """Run the call at once, unless the worker is to be lost."""
         future: Future[Any] = Future()
         name = args[0].folder.name
         self.begun.append(name)

@@ -1314,7 +1314,7 @@ def test_labels_of_two_topics_are_not_mixed(tmp_path: Path) -> None:
 
 
 def test_labels_of_frames_with_equal_stamps_are_told_apart(tmp_path: Path) -> None:
-    """Some drivers repeat stamps: every frame would get the labels of one of them."""
+    """Some drivers repeat stamps; by stamp alone, such frames would all get the same labels."""
     numbers = (3, 4, 6)  # frame 5 is not labelled, frame 6 has its own stamp
     stamps = {3: START, 4: START, 6: START + STEP}
     square = [[1, 0, 3, 0, 3, 2, 1, 2]]

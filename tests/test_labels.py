@@ -546,7 +546,7 @@ def opened_in_excel(path: Path) -> str:
 
 @pytest.mark.parametrize("label", ["Schüssel", "can"])
 def test_labels_survive_a_spreadsheet(run: Path, label: str) -> None:
-    """Excel made *SchÃ¼ssel* of a label with an umlaut, and saved it as a new category."""
+    """Excel turned *Schüssel* into *SchÃ¼ssel*, which then counted as a new category."""
     assert relabel(run, {2: label}) == {}
     corrected = run.parent / "mine.csv"
     corrected.write_text(opened_in_excel(run / "tracks.csv"), "utf-8-sig")

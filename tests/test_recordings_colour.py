@@ -352,7 +352,7 @@ def test_images_kept_for_late_depth_are_limited_in_bytes(
 
 @pytest.mark.parametrize("bare", [0, 2])
 def test_missing_stamps_are_estimated_in_simulated_time(tmp_path: Path, bare: int) -> None:
-    """The log time, decades later, would double all tracks; a simulation may begin at 0."""
+    """Simulated time begins near 0: at the log time, decades later, a frame gets new tracks."""
     expected = [7 + k * SECOND for k in range(4)]
     items = depth_items(*expected)
     items += [("/cam/color/image_raw", t + 9, raw(t, gradient(), "rgb8")) for t in expected]

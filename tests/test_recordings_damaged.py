@@ -403,7 +403,7 @@ def test_bag_is_read_on_after_a_hole(tmp_path: Path, hole: str) -> None:
 
 
 def test_damaged_record_of_a_bag_is_reported_with_its_place(tmp_path: Path) -> None:
-    """All after it is lost, so its place says how much that is."""
+    """Everything after it is lost; its position tells how much that is."""
     path = bag_of(tmp_path / "a.bag")
     data = path.read_bytes()
     at = data.rindex(b"op=\x05")

@@ -333,7 +333,7 @@ def test_time_of_flight_noise_grows_with_distance(z: float) -> None:
 
 
 def test_stereo_holes_are_patches() -> None:
-    """Filters close holes of three pixels; those of real cameras are as wide as their windows."""
+    """Filters close holes of 3 pixels; those of a real stereo camera are as wide as its window."""
     sensor = dataclasses.replace(IDEAL, holes=0.01, hole_px=12)
     depth, _ = measure(wall_image(sensor, 1.0), sensor, np.random.default_rng(0))
     holes, count = label(depth == 0)

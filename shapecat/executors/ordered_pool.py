@@ -69,7 +69,7 @@ class OrderedPool(Generic[_Item, _Result]):
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Kill the other processes."""
+        """Kill the worker processes."""
         if self._executor is not None:
             self._executor.terminate()
 

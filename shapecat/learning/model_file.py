@@ -214,7 +214,11 @@ def _assemble(kind: type[_Record], parts: Mapping[str, Any], prefix: str) -> _Re
 
 
 def _checked(key: str, value: Any, hint: Any, dtype: str | None) -> Any:
-    """Convert a value to the type of its field; raise `_NotAModelError` if it has another type."""
+    """Return a value from a model file in the type of its field.
+
+    The type is ``hint``, or an array of ``dtype`` if that is not None. Raise `_NotAModelError`,
+    with the name ``key`` of the field, if the value is of no type that stands for it.
+    """
     if dtype is not None:
         good = isinstance(value, np.ndarray) and value.dtype == np.dtype(f"<{dtype}")
     elif hint == tuple[str, ...]:

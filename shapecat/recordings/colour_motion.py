@@ -34,6 +34,7 @@ def view_at_its_time(
     ``inverse(fixed_from_colour(colour stamp)) * fixed_from_depth(depth stamp)``. A registered
     image becomes that of a camera with the intrinsics of the depth camera. The view is returned
     unchanged if the stamps are equal, the camera hardly moved, or its motion is unknown.
+    Transforms are read as the recording goes on, so views must come in the order of their frames.
 
     Parameters
     ----------
@@ -41,8 +42,7 @@ def view_at_its_time(
         None.
     fixed_from_sensor : pose of the sensor in the fixed frame; None if unknown.
     fixed_frame : name of that frame; None if there is none.
-    transforms : returns the transforms; called only if they are needed. Call this function with the
-        frames in the order of the recording.
+    transforms : returns the transforms; called only if they are needed.
     """
     if view is None or fixed_from_sensor is None or fixed_frame is None:
         return view

@@ -220,7 +220,7 @@ def is_rectified(topic: str) -> bool:
 
 
 def _field(info: Any, name: str) -> F8:
-    """Return a matrix of a CameraInfo by its ROS 2 name (``k``), or its ROS 1 name (``K``)."""
+    """Return an array of a CameraInfo, flat; ``name`` is that of ROS 2, in lower case."""
     value = getattr(info, name, None)
     if value is None:
         value = getattr(info, name.upper())

@@ -234,9 +234,10 @@ def _by_time(topics: I4, stamps_ns: I4) -> Any:
 
 
 def _times_set_back(stamps_ns: I4) -> I4:
-    """Return how often a clock had been set back at each frame (f,), ignoring single wrong stamps.
+    """Return the number of times that a clock was set back up to each frame, (f,).
 
-    To ignore these, the two frames before are compared with this one and the next.
+    Single wrong stamps do not count: the two frames before must both be later than this one and
+    the next.
     """
     # No second stamp confirms a jump after the first or before the last: neither counts.
     ends = ((stamps_ns.min(), stamps_ns.max()),)

@@ -27,7 +27,7 @@ _BLOCK = 2**16
 
 
 def view_weights(partial: Bool) -> F8:
-    """Return the weights (k,) of views; ``partial`` (k,) marks partial views."""
+    """Return the weights (k,) of views; ``partial`` (k,): whether each is cut off or occluded."""
     return np.where(np.asarray(partial, np.bool_), _PARTIAL_WEIGHT, 1.0)
 
 

@@ -188,8 +188,9 @@ def _line(table: DetectionTable, detections: I4, at: int) -> tuple[F8, F8]:
 def _needed(table: DetectionTable, scenes: I4, row: int, min_hits: int) -> int:
     """Return the number of detections that confirm a track born in frame ``row``.
 
-    ``scenes`` (f,) is the scene of each frame; ``min_hits`` is the most that is needed. Frames of
-    other topics do not count, as their sensors may not see the object.
+    That is ``min_hits``, or the number of frames of its topic in the burst around it, if smaller:
+    the frames within `_BURST_NS` in the same scene. ``scenes`` (f,) numbers the scenes, the parts
+    of the recording between cuts. Sensors of other topics may not see the object.
     """
     frames_near, stamps, topics = 1, table.stamps_ns, table.topics
     for direction in (1, -1):
@@ -203,7 +204,7 @@ def _needed(table: DetectionTable, scenes: I4, row: int, min_hits: int) -> int:
 
 
 def _build_track(number: int, stream: _Followed, track: I4, settings: TrackingSettings) -> Track:
-    """Return the track ``number``, whose detections are ``track`` (n,)."""
+    """Return the track ``number`` of the detections with the indices ``track`` (n,)."""
     table = stream.table
     rows, source = table.frame_span(track, settings.max_missed_s)
     views, weights = table.posteriors[track], table.weights(track)

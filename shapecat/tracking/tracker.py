@@ -66,9 +66,9 @@ class Tracker:
     """Assigns a track number to every detection of a stream of frames.
 
     A detection continues a track with a near predicted centre and a similar size and posterior;
-    confirmed tracks are preferred. All pairs of a frame are chosen together. A Kalman filter with
-    decaying velocity (an Ornstein-Uhlenbeck process) predicts the positions, so that a rolling
-    object is followed through an occlusion while a standing one keeps its position.
+    confirmed tracks are preferred. The detections of a frame are assigned to tracks jointly. A
+    Kalman filter with decaying velocity (an Ornstein-Uhlenbeck process) predicts the positions, so
+    that a rolling object is followed through an occlusion while a standing one keeps its position.
 
     The result does not depend on the order of the detections in a frame: they are sorted by centre,
     size and posterior, which also orders new tracks within a frame. Detections equal in all of
@@ -227,7 +227,7 @@ def _predict(tracks: _Active, elapsed_s: float) -> _Active:
 
 
 def _costs(tracks: _Active, detections: _Active, clock_ns: int, settings: TrackingSettings) -> F8:
-    """Return the costs (m, n) of pairs: distance relative to the gate, plus size and posterior.
+    """Return the costs (m, n) of pairs, from their distance, sizes and posteriors.
 
     ``clock_ns`` is the present time. Tracks that are not confirmed cost more; pairs beyond the gate
     cost infinity.

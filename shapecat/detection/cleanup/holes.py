@@ -88,13 +88,13 @@ def _count_sides(
     total: I4,
     area: I4,
 ) -> None:
-    """Count the sides and the cells of the holes 1..n - 1, in place.
+    """Count, in place, the cells of the holes 1..n - 1, and their sides on the boundary.
 
     ``sides`` (n, labels, 3) holds the counts `BOUNDARY`, `IN_FRONT` and `CONTINUOUS` of the sides
     with each label; ``total`` (n,) also counts sides without a label. ``area`` (n,) counts cells.
     ``inside`` and ``spans`` are from `_between_labels`; ``component`` (rows, columns) is the hole
-    of each cell inside. Cells without depth beside a hole belong to the hole; the label beyond them
-    is its neighbour.
+    of each cell inside. From each side, cells without depth are skipped and added to the area; the
+    label beyond them is the neighbour.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     for i in range(len(spans)):

@@ -52,7 +52,7 @@ class Outline(NamedTuple):
 
 @kernel(inline=True)
 def width_of_part(inv_depth: F4, cells: I4, count: int) -> float:
-    """Return the width of a part along the rows, in cells at a depth of 1 m.
+    """Return the width of a part along the rows: cells times its depth in metres.
 
     ``inv_depth`` is (rows, columns), 1/m; the first ``count`` elements of ``cells`` are the flat
     indices of the part's cells.

@@ -142,7 +142,7 @@ def _count(
 
 @kernel(inline=True)
 def _choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
-    """Choose evenly spaced samples of each segment, away from edges, in place.
+    """Write evenly spaced samples of each segment, away from edges, to ``segments.samples``.
 
     ``labels`` (rows, columns) are the segments.
     """

@@ -71,11 +71,11 @@ def _rate(
     pair: Records,
     logits: F8,
 ) -> None:
-    """Write the logits that ``p`` is one object with each of the segments ``first`` to n.
+    """Write the log-odds that segment ``p`` belongs to the same object as each of ``first`` to n.
 
-    In ``logits`` (n + 1, n + 1), the row is the smaller of the two segment numbers; the logit is
-    -inf if the two are not adjacent. ``features`` are as in `write_pair_features`; ``pair`` (1,) is
-    work space for the features of a pair.
+    In ``logits`` (n + 1, n + 1), for n segments, the row is the smaller of the two segment numbers;
+    the logit is -inf if the two are not adjacent. ``features`` are as in `write_pair_features`;
+    ``pair`` (1,) is work space for the features of a pair.
     """
     adjacent, values = find_adjacent(segments, p, view_geometry), pair.view(np.float32)
     for q in range(first, adjacent.size):

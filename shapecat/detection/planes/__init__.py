@@ -29,12 +29,13 @@ def find_supporting_planes(
     hint : (3,) unit vector away from gravity, sensor frame; None if unknown.
     trials : (n, 3) random numbers from `draw_trials`.
     max_height_m : height of the tallest object, metres.
-    upright : whether the grid is from a real camera, which is rarely held on its side.
+    upright : whether to prefer an up direction near that of the image, since cameras are rarely
+        held on their side; False for a virtual camera.
 
     Returns
     -------
-    The planes, lowest first, and the up direction (3,): the normal of the largest plane. Without a
-    plane, up is the estimate of `estimate_up`, which may be zeros.
+    The planes, lowest first, and the up direction (3,), their normal. Without a plane, up is the
+    estimate of `estimate_up`, which may be zeros.
     """
     points = orient_points(grid)
     prior = np.zeros(3) if hint is None else hint

@@ -98,9 +98,10 @@ def measure_heights(grid: DepthGrid, planes: Records, max_height_m: float) -> He
 def _assign(
     grid: DepthGrid, plane: Row, number: int, max_height_m: float, heights: HeightMap
 ) -> None:
-    """Assign the cells inside the outline of a plane that have no plane yet; loops vectorise.
+    """Assign to a plane the cells inside its outline that belong to no plane yet.
 
-    ``plane`` is a `PLANE`; ``number`` is its number, from 1, in `HeightMap.plane_id`;
+    ``plane`` is a `PLANE`; ``number``, from 1, becomes the `HeightMap.plane_id` of the cells above
+    it, and minus ``number`` that of its own cells;
     ``max_height_m`` is the maximum height above it, metres. The kernel is compiled without
     ``fast``: with it, the inlined copy would round heights differently in the process that compiles
     it and in later ones.

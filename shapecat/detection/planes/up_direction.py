@@ -283,8 +283,8 @@ def _refined(
 ) -> F8:
     """Return the normal (3,) of the largest plane that faces ``direction``, by least squares.
 
-    If the fit turns it away by more than 20 degrees, return ``direction``. ``surface`` and ``bins``
-    are as in `_score`.
+    If it differs from ``direction`` by more than 20 degrees, return ``direction``. ``surface`` and
+    ``bins`` are as in `_score`.
     """
     count, _, _, _ = _count_levels(surface, direction, bins)
     plane = horizontal_plane(intrinsics, direction, -(np.argmax(count) + 0.5) * UP.level_bin_m)

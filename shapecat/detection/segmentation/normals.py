@@ -128,7 +128,7 @@ def _copy_windows(
 def _fit_run(
     values: F4, intrinsics: PinholeIntrinsics, wider: float, i: int, start: int, n: int, fits: F4
 ) -> None:
-    """Fit planes to the windows of ``n`` cells, beginning at (i, ``start``).
+    """Fit a plane to the window around each of ``n`` cells of row i, from column ``start``.
 
     ``wider`` multiplies the gates of `SEGMENTATION`. ``values`` (SIDE * PITCH,) are from
     `_copy_windows`. ``fits`` (6 * PITCH,), written in place, holds blocks of `PITCH`: inverse

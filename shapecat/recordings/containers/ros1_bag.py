@@ -132,10 +132,11 @@ class BagRecording(ChunkedRecording):
                     yield error.record
 
     def _expand(self, record: Record | None, listed: int | None = None) -> Iterator[RawMessage]:
-        """Yield the messages of a record; store its connections if the file has no index.
+        """Yield the messages of a chunk; store its connections if the file has no index.
 
         A truncated chunk is read as far as possible. ``listed`` is its number of messages according
-        to the index; any other number causes a warning. None skips this check.
+        to the index, None if unknown; any other number causes a warning. Other records, and None,
+        have no messages.
         """
         if record is None or record.op not in {CHUNK, CONNECTION}:
             return

@@ -57,7 +57,7 @@ class TransformTrack:
     ----------
     contradicted : whether a clock was set back, and samples after that differ from those before it
         with about the same stamps.
-    delays : the delays of the samples, which need not be sorted by stamp.
+    delays : log time minus stamp of the messages, in their order in the recording.
     latched : whether the last transform remains valid for ever.
     moves : whether a sample is not close to the first one; see `_MOVED_M`.
     static : the static transform, valid when no other one is; None if there is none.
