@@ -46,7 +46,7 @@ from shapecat.system.progress import (
     kernel_words,
 )
 from shapecat.system.scripts import runs_again
-from shapecat.types import Camera, Candidate, Detection, Frame, NeuralGas, Pose, Scene
+from shapecat.types import UNKNOWN, Camera, Candidate, Detection, Frame, NeuralGas, Pose, Scene
 
 __all__ = ["compile_all", "find_ball", "find_mask", "main", "recognize_ball", "rehearse"]
 
@@ -109,7 +109,7 @@ def recognize_ball() -> str:
     cloud = thin(points.astype(np.float32), settings=settings.surface)
     gas = reconstruct(cloud, settings=settings.surface, rng=rng)
     if gas is None:
-        return "unknown"
+        return UNKNOWN
     triangles_of(gas.edges, len(gas.neurons))
     level_from_sensor((0, 0, 1), 0.0, cloud)
     complete(np.add(cloud, 1), (0, 0, 1), 0.0, np.ones(1), ("ball",))

@@ -3,6 +3,8 @@
 import colorsys
 import zlib
 
+from shapecat.types import UNKNOWN
+
 __all__ = ["CATEGORY_COLOURS", "colour_of", "hex_colour"]
 
 CATEGORY_COLOURS: dict[str, tuple[int, int, int]] = {
@@ -13,7 +15,7 @@ CATEGORY_COLOURS: dict[str, tuple[int, int, int]] = {
     "bowl": (240, 185, 40),
     "plate": (35, 190, 205),
     "ball": (214, 80, 190),
-    "unknown": (226, 226, 220),
+    UNKNOWN: (226, 226, 220),
 }
 """Red, green, blue from 0 to 255, legible on light and dark backgrounds; only unknown is grey."""
 

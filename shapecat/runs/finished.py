@@ -14,7 +14,7 @@ from shapecat.runs.labels.corrections import read_labels
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import require_utf8
-from shapecat.types import LabelledFrame
+from shapecat.types import UNKNOWN, LabelledFrame
 
 __all__ = ["FinishedRun", "find_runs", "find_usable", "open_source", "read_finished"]
 
@@ -41,7 +41,7 @@ class FinishedRun:
     def categories(self) -> tuple[str, ...]:
         """The categories in ``common``, then those of the model, then those that a person added."""
         of_model = dict.fromkeys((*self.common, *self.info["model"]["categories"]))
-        added = {label.category for label in self.labels.values()} - {*of_model, "unknown"}
+        added = {label.category for label in self.labels.values()} - {*of_model, UNKNOWN}
         return (*of_model, *sorted(added))
 
     def frames(self) -> Iterator[LabelledFrame]:

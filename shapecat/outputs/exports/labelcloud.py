@@ -17,7 +17,7 @@ from shapecat.outputs.colouring import ExportedFrame
 from shapecat.outputs.colours import hex_colour
 from shapecat.outputs.level_clouds import write_pcd
 from shapecat.runs.finished import FinishedRun
-from shapecat.types import LabelledObject, Pose
+from shapecat.types import UNKNOWN, LabelledObject, Pose
 
 __all__ = ["write_labelcloud"]
 
@@ -54,7 +54,7 @@ def _folder(out: Path, kind: str) -> Path:
 
 
 def _classes(finished: FinishedRun, kind: str) -> str:
-    names = ("unknown", *finished.categories)
+    names = (UNKNOWN, *finished.categories)
     classes = [{"name": name, "id": k, "color": hex_colour(name)} for k, name in enumerate(names)]
     made_by = {"name": "shapecat", "version": finished.info["versions"]["shapecat"]}
     content = {"classes": classes, "default": 0, "type": "object_detection", "format": kind}

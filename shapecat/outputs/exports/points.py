@@ -19,7 +19,7 @@ from shapecat.outputs.colouring import ExportedFrame
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.png import png
 from shapecat.runs.finished import FinishedRun
-from shapecat.types import Frame, LabelledFrame
+from shapecat.types import UNKNOWN, Frame, LabelledFrame
 
 __all__ = ["write_point_labels"]
 
@@ -41,7 +41,7 @@ def write_point_labels(out: Path, frames: Iterable[ExportedFrame], finished: Fin
     if max(finished.labels, default=0) > _LARGEST:
         msg = f"{finished.folder}: has more than {_LARGEST} tracks; 16 bits cannot number them"
         raise OutputError(msg)
-    classes = {name: k for k, name in enumerate(("unknown", *finished.categories), start=1)}
+    classes = {name: k for k, name in enumerate((UNKNOWN, *finished.categories), start=1)}
     count, kinds = 0, set()
     with (out / "frames.csv").open("w", newline="", encoding="utf-8") as file:
         index = csv.writer(file, lineterminator="\n")

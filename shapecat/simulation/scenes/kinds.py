@@ -15,7 +15,7 @@ from shapecat.simulation.scenes.piles import bin_picking, pile, shelf_bin
 from shapecat.simulation.scenes.rooms import room
 from shapecat.simulation.scenes.rows import rows
 from shapecat.simulation.scenes.worlds import World
-from shapecat.types import CATEGORIES
+from shapecat.types import CATEGORIES, UNKNOWN
 
 __all__ = ["SCENES", "SceneKind", "make_scene"]
 
@@ -50,7 +50,7 @@ class _SceneSpec:
         """
         first = [str(c) for c in rng.permutation(self.categories)]
         more = [str(c) for c in rng.choice(self.categories, max(0, count - len(first)))]
-        return [*(first + more)[:count], *["unknown"] * unknown]
+        return [*(first + more)[:count], *[UNKNOWN] * unknown]
 
     def draw_shuffled(self, rng: Generator) -> list[str]:
         """Draw the categories of 4 to 18 objects, one in six unknown, in random order."""

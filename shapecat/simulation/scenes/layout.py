@@ -13,7 +13,7 @@ from shapecat.simulation.shapes.categories import make_object
 from shapecat.simulation.shapes.distractors import make_distractor
 from shapecat.simulation.shapes.mesh import Mesh
 from shapecat.simulation.shapes.stable_poses import StablePose, choose_stable_pose, stable_poses
-from shapecat.types import Pose
+from shapecat.types import UNKNOWN, Pose
 
 __all__ = ["SUPPORTING", "Layout", "Piece", "make_piece", "place_piece"]
 
@@ -49,13 +49,13 @@ def make_piece(category: str, rng: Generator, *, resting_pose: str | None = None
     resting_pose : ``upright``, ``lying`` or ``upside_down``; random by default. An object without
         such a stable pose stands upright.
     """
-    if category == "unknown":
+    if category == UNKNOWN:
         kind, mesh = make_distractor(rng)
     else:
         kind, mesh = category, make_object(category, rng)
     pose_name = resting_pose or _draw_resting_pose(category, rng)
     stable_pose = StablePose(IDENTITY, "upright")
-    if pose_name != "upright" and category not in {"ball", "unknown"}:
+    if pose_name != "upright" and category not in {"ball", UNKNOWN}:
         stable_pose = choose_stable_pose(stable_poses(mesh), pose_name, rng) or stable_pose
     return Piece(category, kind, mesh, stable_pose)
 

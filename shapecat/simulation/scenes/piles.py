@@ -16,6 +16,7 @@ from shapecat.simulation.shapes.categories import make_object
 from shapecat.simulation.shapes.distractors import DISTRACTORS, make_distractor
 from shapecat.simulation.shapes.mesh import Mesh
 from shapecat.simulation.shapes.randomness import log_uniform, random_rotation
+from shapecat.types import UNKNOWN
 
 __all__ = ["KINDS", "Item", "bin_picking", "make_item", "pile", "settled", "shelf_bin"]
 
@@ -115,7 +116,7 @@ def shelf_bin(
 
 def make_item(category: str, rng: Generator, kinds: Sequence[str]) -> Item:
     """Make an object of a category; for ``unknown``, a distractor of one of the kinds."""
-    if category == "unknown":
+    if category == UNKNOWN:
         return Item(category, *make_distractor(rng, str(rng.choice(list(kinds)))))
     return Item(category, category, make_object(category, rng))
 

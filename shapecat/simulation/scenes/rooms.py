@@ -23,6 +23,7 @@ from shapecat.simulation.scenes.physics import Drop
 from shapecat.simulation.scenes.piles import KINDS, Item, make_item, settled
 from shapecat.simulation.scenes.worlds import Support, World, pose_from_yaw
 from shapecat.simulation.shapes.mesh import Mesh
+from shapecat.types import UNKNOWN
 
 __all__ = ["room"]
 
@@ -40,7 +41,7 @@ def room(
     standing = [*_arms(rng, table), *_screens(rng, table)]
     around = [*_surroundings(rng), *_cables(rng, table)]
     drops, items = [], [make_item(category, rng, kinds) for category in categories]
-    items += [Item("unknown", name, make(rng)) for name, make in _devices(rng)]
+    items += [Item(UNKNOWN, name, make(rng)) for name, make in _devices(rng)]
     half = np.ptp(table.outline[:, :2], axis=0) / 2
     for item in items:
         margin = float(item.mesh.extents[:2].max()) / 2
