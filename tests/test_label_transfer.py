@@ -419,7 +419,7 @@ def test_neighbour_does_not_get_label_of_missing_object(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("part_first", [False, True])
 def test_merged_track_may_be_split_in_target(tmp_path: Path, part_first: bool) -> None:
-    """The order of lines must not matter."""
+    """Its tracks would be two objects again. The order of lines must not matter."""
     whole = [None if 5 <= k < 8 else CUP for k in range(FRAMES_EACH)]
     part = static(shifted(CUP, y=0.01), frames=range(5, 8))
     objects = {2: part, 1: whole} if part_first else {1: whole, 2: part}
@@ -430,8 +430,28 @@ def test_merged_track_may_be_split_in_target(tmp_path: Path, part_first: bool) -
 
     transfer = transfer_labels(source, target)
 
-    assert labels_of(target) == {9: "mug", 10: "mug"}
+    assert labels_of(target) == {9: "mug", 10: "merge with 9"}
     assert not transfer.missed
+
+
+@pytest.mark.parametrize("numbers", [(8, 9), (9, 8)])
+def test_parts_stay_merged_if_whole_is_seen_at_both(tmp_path: Path, numbers: Any) -> None:
+    """If the target misses the whole in a frame, the track of its part is the nearest there.
+
+    The label would be copied to both, and the merged object would be two.
+    """
+    later, part = range(1, FRAMES_EACH), shifted(CUP, z=0.075)
+    objects = {1: static(CUP), 2: static(part, frames=later)}
+    labels = {1: "mug", 2: "merge with 1"}
+    source = make_run(tmp_path / "source", objects, labels=labels, size=0.1)
+    both = [shifted(CUP, z=0.03), *static(part)[1:]]
+    target = make_run(
+        tmp_path / "target", {numbers[0]: static(CUP, frames=later), numbers[1]: both}, size=0.1
+    )
+
+    transfer_labels(source, target)
+
+    assert sorted(labels_of(target).values()) == ["merge with 8", "mug"]
 
 
 def test_chain_of_merges_is_transferred(tmp_path: Path) -> None:

@@ -244,8 +244,8 @@ def _translate(
 ) -> tuple[tuple[Transferred, ...], tuple[Missed, ...]]:
     """Return the labels for tracks of the target, and the labels that match no track.
 
-    A *whole* is a track that others were merged with. Its label is copied to its matches. Matches
-    of the other tracks are merged with the first match of the whole.
+    A *whole* is a track that others were merged with. Its label is copied to its matches. If the
+    others have labels to transfer, all matches are one object: they are merged with the first.
     """
     transferred: dict[int, Transferred] = {}
     missed = []
@@ -259,12 +259,12 @@ def _translate(
                 m.track: Transferred(row.track, m.track, row.label, m.distance_m) for m in direct
             }
         else:
-            first, *others = (match.track for match in matches.found[whole])
-            for match in direct:  # empty if the part has no match of its own
-                if match.track not in (first, *others):
-                    label = merging_with(first)
+            first, *others = matches.found[whole]
+            for match in (*others, *direct):  # a part may have no match of its own
+                if match.track != first.track:
+                    label = merging_with(first.track)
                     item = Transferred(row.track, match.track, label, match.distance_m)
-                    transferred.setdefault(match.track, item)
+                    transferred[match.track] = item
     return tuple(transferred.values()), tuple(missed)
 
 
