@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
 from shapecat.colour.masks import Mask
+from shapecat.errors import OutputError
 from shapecat.evaluation.clouds import read_pcd
 from shapecat.evaluation.comparison.references_kitti import KittiLabels
 from shapecat.geometry import IDENTITY
@@ -388,19 +389,32 @@ def test_crops_of_a_renamed_run_replace_the_earlier_ones(tmp_path: Path) -> None
     ("ranges", "kept"),
     [
         ([(None, 10.0), (10.0, 20.5), (20.5, None)], 3),
-        ([(None, 10.0), (10.0, 20.5), (5.0, None)], 1),
         ([(3.0, 10.0), (12.0, 20.5), (None, 11.0)], 2),
         ([(3.0, 10.0), (None, None)], 1),
-        ([(None, None), (3.0, 10.0)], 1),
+        ([(0.12345, 10.12345), (0.12345, 10.12345)], 1),
     ],
 )
 def test_crops_of_other_time_ranges_stay(tmp_path: Path, ranges: Any, kept: int) -> None:
-    """Those of overlapping ranges are replaced: they show the same objects in the same frames."""
+    """Those of included ranges are replaced: they show the same objects in the same frames."""
     for start, end in ranges:
         made = crops_run("/depth", start_s=start, end_s=end)
         assert write_crops(tmp_path, crops_frames("/depth"), made) == 1
 
     assert len(list(tmp_path.glob("*/*/*.pcd"))) == kept
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [((None, None), (3.0, 10.0)), ((None, 10.0), (5.0, None))]
+)
+def test_crops_do_not_replace_those_of_more_frames(tmp_path: Path, first: Any, second: Any) -> None:
+    """The views of the frames that the new run lacks would be lost, with their labels."""
+    made, part = (crops_run("/depth", start_s=start, end_s=end) for start, end in (first, second))
+    write_crops(tmp_path, crops_frames("/depth"), made)
+
+    with pytest.raises(OutputError, match="has views of another time range of this recording"):
+        write_crops(tmp_path, crops_frames("/depth"), part)
+
+    assert [Origin.read(path.name) for path in tmp_path.glob("*/*")] == [Origin.of(made)]
 
 
 def dataset_image() -> DatasetImage:

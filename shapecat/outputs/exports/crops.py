@@ -42,7 +42,8 @@ class Origin(NamedTuple):
         source = "\0".join([finished.info["input"]["digest"], *sorted(options["topics"])])
         start, end = options.get("start_s"), options.get("end_s")
         digest = xxhash.xxh3_64_hexdigest(source.encode())[:12]
-        return cls(digest, start or 0.0, math.inf if end is None else end)
+        # Rounded as in the name of an instance, so that a run includes its own earlier views.
+        return cls(digest, round(start or 0.0, 3), math.inf if end is None else round(end, 3))
 
     @classmethod
     def read(cls, instance: str) -> "Origin | None":
@@ -56,6 +57,10 @@ class Origin(NamedTuple):
         begin, end = max(self.start_s, other.start_s), min(self.end_s, other.end_s)
         return self.source == other.source and begin < end
 
+    def includes(self, other: "Origin") -> bool:
+        """Return whether the time range includes that of another origin."""
+        return self.start_s <= other.start_s and other.end_s <= self.end_s
+
     def __str__(self) -> str:
         is_whole = (self.start_s, self.end_s) == (0, math.inf)
         return self.source if is_whole else f"{self.source}.{self.start_s:.3f}-{self.end_s:.3f}"
@@ -64,15 +69,16 @@ class Origin(NamedTuple):
 def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
     """Add the views of a run to a data set; return their number.
 
-    Earlier views of the same topics of the recording are replaced if the time ranges overlap, even
-    if their run had another name. No view then has an outdated label or occurs twice. Deleted
+    Earlier views of the same topics of the recording are replaced if their time range is included,
+    even if their run had another name. No view then has an outdated label or occurs twice. Deleted
     tracks are left out; ``unknown`` is a category like any other.
 
     Raises
     ------
-    OutputError : ``out`` is not writable.
+    OutputError : ``out`` is not writable, or holds views of a range that only overlaps.
     """
     origin = Origin.of(finished)
+    _earlier_views(out, origin)
     prefix = f"{safe_name(finished.name)}.{origin}"
     hidden = out / f".{prefix}.partial"
     topics = finished.info["options"]["topics"]
@@ -98,11 +104,27 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
     return count
 
 
+def _earlier_views(out: Path, origin: Origin) -> list[Path]:
+    """Return the instances that a new export of the same frames replaces.
+
+    Raises
+    ------
+    OutputError : an instance also has views of frames that the new export lacks.
+    """
+    found = [(old, Origin.read(old.name)) for old in out.glob("[!.]*/*.track-*")]
+    shared = [(old, earlier) for old, earlier in found if earlier and earlier.shares_frames(origin)]
+    for old, earlier in shared:
+        if not origin.includes(earlier):
+            msg = (
+                f"{old}: has views of another time range of this recording; choose another --out, "
+                "or move them away"
+            )
+            raise OutputError(msg)
+    return [old for old, _ in shared]
+
+
 def _replace(out: Path, origin: Origin, hidden: Path) -> None:
-    for old in list(out.glob("[!.]*/*.track-*")):
-        earlier = Origin.read(old.name)
-        if earlier is None or not earlier.shares_frames(origin):
-            continue
+    for old in _earlier_views(out, origin):
         shutil.rmtree(old)
         if not any(old.parent.iterdir()):
             old.parent.rmdir()
