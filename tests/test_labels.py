@@ -125,6 +125,7 @@ def test_damaged_table_of_shapecat_is_refused(run: Path) -> None:
         ("7", "is not a category"),
         ("../../etc", "is not a category"),
         ("a/b", "a category is a letter followed by letters, digits, spaces and - _ . + & ' ( )"),
+        ("box.", "; the last is a letter, a digit, _ or )"),
         ("merge", "is not a category"),
         ("del", "is not a category"),
         (".", "is not a category"),

@@ -32,7 +32,7 @@ function misread(label, names) {
     return "Write a category, delete, or merge with #3.";
   }
   if (!NAME.test(name.replace(/\p{M}/gu, ""))) {
-    return "A name begins with a letter, and has at most 60 letters, digits, spaces and - _ . + & ' ( )";
+    return "A name begins with a letter, ends with a letter, a digit, _ or ), and has at most 60 letters, digits, spaces and - _ . + & ' ( )";
   }
   const allowed = (other) => (Math.min(name.length, other.length) < 5 ? 1 : 2);
   const near = !NEW.test(label) && [...names, "delete"].find((other) => slips(name, other) <= allowed(other));

@@ -34,7 +34,8 @@ _RESERVED = ("none", "dontcare", "na", "nan", "null")
 """Names that mean "no object" in exported formats, or "no value" to readers of tables."""
 _NAME = re.compile(r"[^\W\d_][\w .+&'()-]{0,58}[\w)]|[^\W\d_]")
 NAME_RULE = (
-    "a letter followed by letters, digits, spaces and - _ . + & ' ( ), at most 60 characters"
+    "a letter followed by letters, digits, spaces and - _ . + & ' ( ), at most 60 characters; the "
+    "last is a letter, a digit, _ or )"
 )
 """The rule for the name of a category, in words."""
 _SHOWN = 80
