@@ -157,7 +157,7 @@ def break_header(members: dict[str, bytes]) -> None:
 
 
 _HOSTILE = {
-    "older": (edit_header(version=2), "version 2, this shapecat reads version 3"),
+    "older": (edit_header(version=2), "reads version 3; make one with `shapecat learn`"),
     "newer": (edit_header(version=4), "version 4"),
     "other format": (edit_header(format="x"), "does not say"),
     "header is a list": (lambda m: m.update({"header.json": b"[]"}), "does not say"),

@@ -124,7 +124,9 @@ def _read(source: Traversable, name: str) -> Categorizer:
         return _parse(content)
     except (_NotAModelError, ValueError, TypeError, OverflowError, RecursionError) as error:
         reason = str(error).strip("'\"").partition("\n")[0]
-        msg = f"{name}: not a usable model file: {reason}; train one with `shapecat train`"
+        msg = (
+            f"{name}: not a usable model file: {reason}; make one with `shapecat learn` or `train`"
+        )
         raise ModelError(msg) from error
 
 
