@@ -17,6 +17,7 @@ from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run, staged, write_run
 from shapecat.runs.identity import new_id
 from shapecat.runs.jobs import Job
+from shapecat.runs.labelled_tracks import LabelledTracks
 from shapecat.runs.labels.corrections import adopt_labels, read_labels
 from shapecat.runs.labels.replaced import keep_labels
 from shapecat.runs.labels.same_objects import Match, _by_majority, _mutual_nearest
@@ -765,6 +766,26 @@ def test_labels_of_another_recording_wait_until_they_are_asked_for(tmp_path: Pat
     assert [labels_in(table) for table in old.glob("tracks.previous-*.csv")] == [{"delete"}]
     assert not transfer_labels(new / "tracks.previous.csv", new).missed
     assert labels_of(new) == {1: "delete"}
+
+
+def test_unreadable_tables_of_another_version_cost_no_labels(tmp_path: Path) -> None:
+    """The message asked to process the recording again, which had just been done."""
+    old = make_run(tmp_path / "lab", {4: static(CUP)}, labels={4: "mug"})
+    tracks = pq.read_table(old / "tracks.parquet")
+    single = tracks["center_fixed"].cast(pa.list_(pa.float32()))
+    k = tracks.column_names.index("center_fixed")
+    pq.write_table(tracks.set_column(k, "center_fixed", single), old / "tracks.parquet")
+    with pytest.raises(OutputError, match="again with --overwrite, which keeps labels"):
+        LabelledTracks.read(old, {})
+    new = make_run(tmp_path / "new", {1: static(CUP)})
+    run = read_run(new)
+
+    keep_labels(new, run, Job(tmp_path / "lab.mcap", old))
+
+    (missed,) = run["corrections"]["not_transferred"]
+    assert "column center_fixed holds list" in missed["reason"]
+    assert "again" not in missed["reason"]
+    assert labels_in(new / "tracks.previous.csv") == {"mug"}
 
 
 @pytest.mark.parametrize("fixed_frame", ["map", None])

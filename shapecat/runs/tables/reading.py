@@ -18,6 +18,7 @@ from shapecat.errors import OutputError
 from shapecat.runs.tables.schemas import FIXED_LISTS, FULL_BOX, TABLES
 
 __all__ = [
+    "AGAIN",
     "Key",
     "count_rows",
     "first_stamp",
@@ -39,6 +40,8 @@ __all__ = [
     "with_fixed_lists",
 ]
 
+AGAIN = "process the recording again"
+"""The remedy in the messages about unreadable tables."""
 _NUMBERS = {"center", "size", "orientation", "posterior", *FULL_BOX}
 """Columns whose numbers are finite."""
 _TUPLES = {"edges": 2, "neurons": 3, "outline": 3}
@@ -156,14 +159,14 @@ def read_together(
         yield from zip(*groups, strict=True)
     except ValueError as error:  # of zip
         names = ", ".join(columns)
-        msg = f"{folder}: {names} have different row groups; process the recording again"
+        msg = f"{folder}: {names} have different row groups; {AGAIN}"
         raise OutputError(msg) from error
 
 
 def misfit(folder: Path) -> OutputError:
     """Return the error for tables of a run whose rows refer to missing rows of other tables."""
     problem = "its tables are inconsistent, as if from different runs"
-    msg = f"{folder}: {problem}; process the recording again"
+    msg = f"{folder}: {problem}; {AGAIN}"
     return OutputError(msg)
 
 
@@ -248,11 +251,11 @@ def opened(
     try:
         with _open_parquet(path, read_dictionary) as file:
             if wrong := _wrong_column(file.schema_arrow, TABLES[path.stem], columns):
-                msg = f"{path}: {wrong}; process the recording again"
+                msg = f"{path}: {wrong}; {AGAIN} with --overwrite, which keeps labels"
                 raise OutputError(msg)
             yield file
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
-        msg = f"{path}: not a readable table of a run folder ({error}); process the recording again"
+        msg = f"{path}: not a readable table of a run folder ({error}); {AGAIN}"
         raise OutputError(msg) from error
 
 
