@@ -190,7 +190,7 @@ def _add_outputs(
             run["seconds"].pop(output, None)
     differing = differences(run, planned)
     if not same_content(run["input"], job.source, content.result):
-        differing["input"] = f"{run['input']['path']} in the old run"
+        differing["input"] = f"{run['input']['path']} with other content in the old run"
     if differing:
         other = describe_differences(differing)
         msg = f"{job.folder}: has results of {other}; choose another --out, or --overwrite it"

@@ -51,6 +51,7 @@ def test_overwrite_keeps_other_files_in_run_folder(
 
 
 def test_recording_damaged_after_its_run_is_noticed(shapecat: Run, tmp_path: Path) -> None:
+    """The path alone, which is the same, would not say what differs."""
     lab = record(tmp_path / "lab.bag", 12, container="ros1")  # not compressed: depth, not chunks
     content = bytearray(lab.read_bytes())
     command = ("process", lab, "--out", tmp_path / "out", *OPTIONS)
@@ -63,6 +64,7 @@ def test_recording_damaged_after_its_run_is_noticed(shapecat: Run, tmp_path: Pat
 
     assert result.exit_code == 1
     assert "another input" in result.stderr
+    assert "lab.bag with other content in the old run" in result.stderr
     assert "already complete" not in result.stdout
 
 
