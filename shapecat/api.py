@@ -157,6 +157,12 @@ def process(
     """
     _require_known(settings, process.__annotations__)
     frame_range = FrameRange(start_s, end_s, every)
+    if cores < 1:
+        msg = f"cores must be at least 1, got {cores}"
+        raise ConfigError(msg)
+    if discard_labels and not overwrite:
+        msg = "discard_labels needs overwrite: without it, labels stay with their results"
+        raise ConfigError(msg)
     if cores > 1 and runs_again():
         msg = f'cores={cores} starts processes: a script needs `if __name__ == "__main__":`'
         raise ConfigError(msg)

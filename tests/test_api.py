@@ -604,6 +604,7 @@ def test_null_list_becomes_row_of_nan(tmp_path: Path) -> None:
 
 
 def test_wrong_settings_and_folders_are_refused(page_folder: Path, tmp_path: Path) -> None:
+    """An option without effect, as labels that are not discarded, would go unnoticed."""
     with pytest.raises(ConfigError, match=r"did you mean detection\.max_range_m"):
         shapecat.process(page_folder / "demo.mcap", tmp_path, detection={"max_range": 1.0})
     with pytest.raises(OutputError, match="another input, model or settings"):
@@ -614,6 +615,10 @@ def test_wrong_settings_and_folders_are_refused(page_folder: Path, tmp_path: Pat
         ConfigError, match=r"unknown option or setting topic; did you mean topics\?"
     ):
         shapecat.process(page_folder / "demo.mcap", tmp_path, topic="/camera/depth/image_raw")
+    with pytest.raises(ConfigError, match="discard_labels needs overwrite"):
+        shapecat.process(page_folder / "demo.mcap", tmp_path, discard_labels=True)
+    with pytest.raises(ConfigError, match="cores must be at least 1, got 0"):
+        shapecat.process(page_folder / "demo.mcap", tmp_path, cores=0)
     with pytest.raises(AttributeError, match="nothing"):
         _ = shapecat.nothing
 
