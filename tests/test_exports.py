@@ -236,6 +236,20 @@ def test_kitti_boxes_match_tables_within_1_mm(run: Path, tmp_path: Path, which: 
     assert {"wine_glass", "unknown"} <= kinds
 
 
+def test_kitti_refuses_categories_with_the_same_type(
+    shapecat: Run, guessed_run: Path, tmp_path: Path
+) -> None:
+    """Objects of two categories would have one type; which was which could not be recovered."""
+    folder = tmp_path / "table"
+    shutil.copytree(guessed_run, folder)
+    relabel(folder, {1: "new wine glass", 2: "new wine_glass"})
+    result = shapecat("export", folder, "--format", "kitti", "--out", tmp_path / "kitti")
+
+    assert result.exit_code == 1
+    assert "'wine glass' and 'wine_glass' have the same KITTI type" in result.output
+    assert not (tmp_path / "kitti" / "table").exists()
+
+
 def intrinsics(run: Path) -> np.ndarray:
     finished = read_finished(run)
     with open_source(finished.info) as recording:

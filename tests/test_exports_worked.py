@@ -75,8 +75,8 @@ def frame() -> Frame:
 
 def kitti(folder: Path, *, cut: bool, hidden: bool) -> KittiLabel:
     views: Any = [(labelled(cut=cut, hidden=hidden), frame(), None)]
-    unused: Any = SimpleNamespace()
-    assert write_kitti(folder, views, unused) == 1
+    finished: Any = SimpleNamespace(categories=())
+    assert write_kitti(folder, views, finished) == 1
     (label,) = read_labels(folder)
     return label
 
@@ -124,8 +124,8 @@ def test_kitti_frame_of_depth_image_looks_along_its_camera(
     up = level_from_sensor.inv().apply([0, -1, 0])
     seen = replace(labelled(cut=False, hidden=False), up=up)
     views: Any = [(seen, frame(), None)]
-    unused: Any = SimpleNamespace()
-    write_kitti(tmp_path, views, unused)
+    finished: Any = SimpleNamespace(categories=())
+    write_kitti(tmp_path, views, finished)
 
     level = level_from_sensor.apply(frame().xyz())  # x right, y down, z forward
     assert_allclose(read_points(tmp_path)[:, :3], level[:, [2, 0, 1]] * [1, -1, -1], atol=1e-5)
@@ -143,8 +143,8 @@ def test_kitti_calibration_projects_points_into_colour_camera(tmp_path: Path) ->
     image = ColourImage("/color", 5, 6, "color", "rgb8", 200, 150, 600, data)
     view = ColourView(image, LensCamera(camera), pose)
     views: Any = [(labelled(cut=False, hidden=False), frame(), Coloured(view, ()))]
-    unused: Any = SimpleNamespace()
-    assert write_kitti(tmp_path, views, unused) == 1
+    finished: Any = SimpleNamespace(categories=())
+    assert write_kitti(tmp_path, views, finished) == 1
 
     x, y, z = (frame().xyz() @ pose.rotation.T + pose.translation).T
     u, v = 171.0 * x / z + 103.2, 166.0 * y / z + 71.5
@@ -185,8 +185,8 @@ def test_kitti_image_is_that_of_its_pinhole_camera(tmp_path: Path) -> None:
     image = ColourImage("/color", 5, 6, "color", "rgb8", 200, 150, 600, pixels.tobytes())
     view = ColourView(image, LensCamera(camera, "plumb_bob", lens), pose)
     views: Any = [(labelled(cut=False, hidden=False), frame(), Coloured(view, ()))]
-    unused: Any = SimpleNamespace()
-    write_kitti(tmp_path, views, unused)
+    finished: Any = SimpleNamespace(categories=())
+    write_kitti(tmp_path, views, finished)
 
     expected = projected_points(tmp_path)[row * CAMERA.width + column]
     drawn = np.asarray(Image.open(tmp_path / "image_2" / "000000.png").convert("L"), float)
@@ -202,8 +202,8 @@ def test_kitti_image_on_depth_pixels_has_the_depth_camera(tmp_path: Path) -> Non
     lens = LensCamera(Camera(160, 120, 144.1, 140.3, 76.2, 62.8), "plumb_bob", (0.02, 0, 0, 0, 0))
     coloured = Coloured(ColourView(image, lens), ())
     views: Any = [(labelled(cut=False, hidden=False), frame(), coloured)]
-    unused: Any = SimpleNamespace()
-    write_kitti(tmp_path, views, unused)
+    finished: Any = SimpleNamespace(categories=())
+    write_kitti(tmp_path, views, finished)
 
     v, u = np.mgrid[:120, :160]
     assert_allclose(projected_points(tmp_path), np.c_[u.ravel(), v.ravel()], atol=2e-3)
@@ -230,8 +230,8 @@ def test_kitti_2d_box_is_clipped_to_colour_image(
     )
     coloured = Coloured(ColourView(image, LensCamera(camera), IDENTITY), ())
     views: Any = [(labelled(cut=False, hidden=False), frame(), coloured)]
-    unused: Any = SimpleNamespace()
-    write_kitti(tmp_path, views, unused)
+    finished: Any = SimpleNamespace(categories=())
+    write_kitti(tmp_path, views, finished)
 
     assert read_labels(tmp_path)[0].box == box
 
@@ -297,8 +297,8 @@ def test_kitti_2d_box_of_cloud_is_minus_one(tmp_path: Path) -> None:
     points = frame().xyz()
     cloud = Frame("/scan", 0, 5, 6, "laser", points=points)
     views: Any = [(labelled(cut=False, hidden=False), cloud, None)]
-    unused: Any = SimpleNamespace()
-    write_kitti(tmp_path, views, unused)
+    finished: Any = SimpleNamespace(categories=())
+    write_kitti(tmp_path, views, finished)
 
     assert read_labels(tmp_path)[0].box == [-1, -1, -1, -1]
     assert len(read_points(tmp_path)) == len(points)
@@ -309,8 +309,8 @@ def test_kitti_keeps_cloud_of_level_lidar(tmp_path: Path) -> None:
     points = np.array([[4.0, 1.0, -0.5], [2.0, -3.0, 0.25]], np.float32)
     level = replace(labelled(cut=False, hidden=False), up=np.array([0.0, 0.0, 1.0]), objects=())
     views: Any = [(level, Frame("/scan", 0, 5, 6, "laser", points=points), None)]
-    unused: Any = SimpleNamespace()
-    write_kitti(tmp_path, views, unused)
+    finished: Any = SimpleNamespace(categories=())
+    write_kitti(tmp_path, views, finished)
 
     assert_allclose(read_points(tmp_path)[:, :3], points, atol=1e-6)
 
@@ -318,12 +318,12 @@ def test_kitti_keeps_cloud_of_level_lidar(tmp_path: Path) -> None:
 def test_kitti_turns_loose_points_of_camera_like_its_image(tmp_path: Path) -> None:
     """Taken for a laser scanner with x forward, the scene would be beside the camera."""
     cloud = Frame("/points", 0, 5, 6, "optical", points=frame().xyz())
-    unused: Any = SimpleNamespace()
+    finished: Any = SimpleNamespace(categories=())
     found = []
     for name, seen in (("image", frame()), ("cloud", cloud)):
         (tmp_path / name).mkdir()
         views: Any = [(labelled(cut=False, hidden=False), seen, None)]
-        write_kitti(tmp_path / name, views, unused)
+        write_kitti(tmp_path / name, views, finished)
         found.append(read_points(tmp_path / name))
 
     assert_allclose(found[1], found[0])
@@ -606,9 +606,9 @@ def test_kitti_lists_frame_of_each_number(tmp_path: Path) -> None:
     view = labelled(cut=False, hidden=False)
     other = replace(view, topic="/left", index=17, stamp_ns=12_345, objects=())
     views: Any = [(view, frame(), None), (other, frame(), None)]
-    unused: Any = SimpleNamespace()
+    finished: Any = SimpleNamespace(categories=())
 
-    assert write_kitti(tmp_path, views, unused) == 1
+    assert write_kitti(tmp_path, views, finished) == 1
     assert (tmp_path / "frames.csv").read_text() == (
         "number,topic,frame,stamp_ns\n000000,/depth,0,5\n000001,/left,17,12345\n"
     )
@@ -629,9 +629,9 @@ def test_kitti_2d_box_is_that_of_the_image_that_is_written(
     folders = tmp_path / "with", tmp_path / "alone"
     for folder, coloured in zip(folders, (Coloured(view, ()), None), strict=True):
         views: Any = [(labelled(cut=False, hidden=False), frame(), coloured)]
-        unused: Any = SimpleNamespace()
+        finished: Any = SimpleNamespace(categories=())
         folder.mkdir()
-        write_kitti(folder, views, unused)
+        write_kitti(folder, views, finished)
     (label,), (alone,) = map(read_labels, folders)
 
     if without == "view":  # the colour camera does not see it

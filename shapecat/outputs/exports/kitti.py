@@ -19,6 +19,7 @@ from PIL import Image
 from shapecat.arrays import F8
 from shapecat.cameras.colour import LensCamera
 from shapecat.colour.projection import project, rectified
+from shapecat.errors import OutputError
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
 from shapecat.outputs.colouring import Coloured, ExportedFrame
 from shapecat.recordings import MessageError
@@ -33,13 +34,18 @@ _log = logging.getLogger(__name__)
 _VELO_FROM_RECTIFIED = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def write_kitti(out: Path, frames: Iterable[ExportedFrame], _finished: FinishedRun) -> int:
+def write_kitti(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
     """Write label_2/, calib/ and velodyne/, with six-digit names; return the number of objects.
 
     Colour images are written to image_2/ as undistorted PNG. ``frames.csv`` maps each
     number to its frame. Points are in the level frame of the sensor (x forward, y left, z up), with
     intensity 0. The type is the category, with spaces replaced by ``_``.
+
+    Raises
+    ------
+    OutputError : two categories have the same type.
     """
+    _require_distinct_types(finished.categories)
     for name in ("label_2", "calib", "velodyne"):
         (out / name).mkdir()
     count = 0
@@ -59,6 +65,14 @@ def write_kitti(out: Path, frames: Iterable[ExportedFrame], _finished: FinishedR
             rows.astype("<f4").tofile(out / "velodyne" / f"{number:06d}.bin")
             count += len(lines)
     return count
+
+
+def _require_distinct_types(categories: Iterable[str]) -> None:
+    types: dict[str, str] = {}
+    for name in categories:
+        if (other := types.setdefault(kitti_type(name).lower(), name)) != name:
+            msg = f"the categories {other!r} and {name!r} have the same KITTI type; relabel one"
+            raise OutputError(msg)
 
 
 def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
