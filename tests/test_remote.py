@@ -123,6 +123,18 @@ def test_recordings_of_server_are_processed_into_folder(
     assert again.stdout.count("already complete") == 2
 
 
+def test_page_without_links_is_an_empty_folder(
+    shapecat: Run, address: str, served: Path, tmp_path: Path
+) -> None:
+    """It ended the command with a traceback."""
+    (served / "empty").mkdir()
+    done = shapecat("process", f"{address}/empty/", "--out", tmp_path, *OPTIONS)
+    (served / "empty").rmdir()
+
+    assert done.exit_code == 3
+    assert f"{address}/empty/: no recording found" in done.output
+
+
 def test_names_on_server_are_decoded(
     shapecat: Run, address: str, served: Path, tmp_path: Path
 ) -> None:

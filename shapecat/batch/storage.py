@@ -252,7 +252,9 @@ class Location:
         if self._is_s3():
             yield from self._list_pages(deep=deep)
         elif deep:
-            yield from self._retry("listed", lambda: system.find(path, detail=True)).values()
+            found = self._retry("listed", lambda: system.find(path, detail=True))
+            # Of a path that is a file, as is a page without links, the info is empty.
+            yield from ({"name": name, **info} for name, info in found.items())
         else:
             yield from self._retry("listed", lambda: system.ls(path, detail=True))
 
