@@ -109,4 +109,7 @@ def _row(job: "Job", summary: "Summary") -> tuple[Any, ...]:
 
 
 def _short_name(job: "Job") -> str:
-    return job.name.rpartition("/")[2]
+    """Return the name of the recording without folders and the query, which may have slashes."""
+    from shapecat.batch.storage import names_in
+
+    return names_in(job.origin)[1] if job.origin else job.source.name

@@ -190,7 +190,7 @@ def test_lost_labels_are_reported_in_a_batch_of_any_size(
             counts={"frames": 30, "tracks": {}}, seconds=1.0, processed=True,
             corrections=lost, folder=Path(name),
         )  # fmt: skip
-        job = SimpleNamespace(name=name, folder=Path("out", name), target="")
+        job = Job(Path(name), Path("out", name))
         tally.add(SimpleNamespace(job=job, summary=summary, code=0))
     OUTCOMES.print_closing([task(name) for name in names], tally)
 

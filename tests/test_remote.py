@@ -105,7 +105,7 @@ def results(url: str) -> set[str]:
 def test_recordings_of_server_are_processed_into_folder(
     shapecat: Run, address: str, served: Path, tmp_path: Path
 ) -> None:
-    """A signed URL has a query, which is not part of a name."""
+    """A signed URL has a query, which is not part of a name, nor of the printed one."""
     names = ("a.mcap", "b.bag?signature=4/2.mcap", "broken.mcap", "missing.mcap")
     urls = [f"{address}/{name}" for name in names]
     done = shapecat("process", *urls, "--out", tmp_path / "out", *OPTIONS)
@@ -115,6 +115,7 @@ def test_recordings_of_server_are_processed_into_folder(
     for name in ("broken.mcap", "missing.mcap"):
         assert f"{address}/{name}" in done.stderr
     assert {path.parent.name for path in (tmp_path / "out").glob("*/run.json")} == {"a", "b"}
+    assert [line.split()[0] for line in done.stdout.splitlines()[1:3]] == ["a.mcap", "b.bag"]
     run = json.loads((tmp_path / "out" / "a" / "run.json").read_text())
     assert run["input"]["path"] == urls[0]
     tables = [tmp_path / out / "a" / "tracks.csv" for out in ("out", "here")]
