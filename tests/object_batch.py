@@ -73,7 +73,7 @@ def run(count: int, folder: Path, *, refused: float) -> Report:
             wait_until(lambda: len(set(made(log))) >= 2 * count // 3, process)
             cluster.kill()
             cluster = DaskCluster(address, folder / "dask")
-            process.wait(timeout=60 + 5 * count)
+            process.wait(timeout=300 + 5 * count)
         finally:
             process.kill()
             cluster.kill()
