@@ -150,8 +150,8 @@ def process(
 
     Raises
     ------
-    ConfigError : an option or setting does not exist or has an invalid value, or several processes
-        are requested and the script lacks the ``__main__`` line.
+    ConfigError : an option or setting does not exist, has an invalid value or would have no effect,
+        or several processes are requested and the script lacks the ``__main__`` line.
     RecordingError : the recording cannot be read, or is a folder of several recordings.
     NoStreamError, ModelError, OutputError : as for the command, which prints them.
     """

@@ -266,10 +266,7 @@ def find_up(frame: Frame, settings: Settings) -> F4 | None:
 
 
 def level_points(frame: Frame, scene: Scene, candidate: Candidate) -> tuple[F8, Pose]:
-    """Return the points (n, 3) of a candidate, metres, and the level frame they are in.
-
-    The frame is given as its pose `level_from_sensor`.
-    """
+    """Return the points (n, 3) of a candidate, metres, level frame, and `level_from_sensor`."""
     points = frame.xyz(candidate.indices)
     level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
     return transform(level, points), level

@@ -218,8 +218,8 @@ def _assemble(kind: type[_Record], parts: Mapping[str, Any], prefix: str) -> _Re
 def _checked(key: str, value: Any, hint: Any, dtype: str | None) -> Any:
     """Return a value from a model file in the type of its field.
 
-    The type is ``hint``, or an array of ``dtype`` if that is not None. Raise `_NotAModelError`,
-    with the name ``key`` of the field, if the value is of no type that stands for it.
+    The type is ``hint``, or an array of ``dtype`` if that is not None. A list may stand for a
+    tuple, and an integer for a float; otherwise raise `_NotAModelError`, which names ``key``.
     """
     if dtype is not None:
         good = isinstance(value, np.ndarray) and value.dtype == np.dtype(f"<{dtype}")

@@ -101,10 +101,9 @@ def _assign(
     """Assign to a plane the cells inside its outline that belong to no plane yet.
 
     ``plane`` is a `PLANE`; ``number``, from 1, becomes the `HeightMap.plane_id` of the cells above
-    it, and minus ``number`` that of its own cells;
-    ``max_height_m`` is the maximum height above it, metres. The kernel is compiled without
-    ``fast``: with it, the inlined copy would round heights differently in the process that compiles
-    it and in later ones.
+    it, and minus ``number`` that of its own cells; ``max_height_m`` is the maximum height above it,
+    metres. The kernel is compiled without ``fast``: with it, the inlined copy would round heights
+    differently in the process that compiles it and in later ones.
     """
     inv_depth, intrinsics, (plane_id, height) = grid.inverse_depth, grid.intrinsics, heights
     rows, columns = inv_depth.shape

@@ -7,7 +7,7 @@ z = 0. VIEWPOINT is the pose of the sensor.
 import math
 import re
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -78,7 +78,7 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
     OutputError : ``out`` is not writable, or holds views of a range that only overlaps.
     """
     origin = Origin.of(finished)
-    _earlier_views(out, origin)
+    earlier = _earlier_views(out, origin)
     prefix = f"{safe_name(finished.name)}.{origin}"
     hidden = out / f".{prefix}.partial"
     topics = finished.info["options"]["topics"]
@@ -98,7 +98,7 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
                     view = instance / f"{stem}{labelled.index:06d}.pcd"
                     write_pcd(view, cloud[0], viewpoint=cloud[1])
                     count += 1
-            _replace(out, origin, hidden)
+            _replace(out, earlier, hidden)
     finally:
         shutil.rmtree(hidden, ignore_errors=True)
     return count
@@ -123,8 +123,8 @@ def _earlier_views(out: Path, origin: Origin) -> list[Path]:
     return [old for old, _ in shared]
 
 
-def _replace(out: Path, origin: Origin, hidden: Path) -> None:
-    for old in _earlier_views(out, origin):
+def _replace(out: Path, earlier: Sequence[Path], hidden: Path) -> None:
+    for old in earlier:
         shutil.rmtree(old)
         if not any(old.parent.iterdir()):
             old.parent.rmdir()

@@ -43,7 +43,7 @@ def write_kitti(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
 
     Raises
     ------
-    OutputError : two categories have the same type.
+    OutputError : two categories have the same type, but for upper and lower case.
     """
     _require_distinct_types(finished.categories)
     for name in ("label_2", "calib", "velodyne"):
@@ -68,6 +68,7 @@ def write_kitti(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
 
 
 def _require_distinct_types(categories: Iterable[str]) -> None:
+    """Raise an error if readers that ignore case cannot tell the types of two categories apart."""
     types: dict[str, str] = {}
     for name in categories:
         if (other := types.setdefault(kitti_type(name).lower(), name)) != name:

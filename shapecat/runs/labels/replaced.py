@@ -11,7 +11,7 @@ from shapecat.runs.labels.corrections import LOST, PREVIOUS, has_labels
 from shapecat.runs.labels.track_table import ORIGINAL
 from shapecat.runs.labels.transfer import lost_labels, transfer_labels
 from shapecat.runs.run_info import RunInfo
-from shapecat.runs.tables.reading import AGAIN
+from shapecat.runs.tables.reading import PROCESS_AGAIN
 from shapecat.system.files import replacing
 
 __all__ = ["forget_old_labels", "keep_labels", "require_labels"]
@@ -55,7 +55,7 @@ def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
         other = read_identity(job.folder)["input"]["digest"] != run["input"]["digest"]
         transfer = lost_labels(job.folder, _OTHER) if other else transfer_labels(job.folder, folder)
     except OutputError as error:
-        reason = str(error).partition(f"; {AGAIN}")[0]  # which has just been done
+        reason = str(error).partition(f"; {PROCESS_AGAIN}")[0]  # which has just been done
         transfer = lost_labels(job.folder, reason)
     if transfer.missed:
         copy = LOST.replace("*", xxhash.xxh3_64_hexdigest(table)[:8])

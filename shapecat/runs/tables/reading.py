@@ -18,7 +18,7 @@ from shapecat.errors import OutputError
 from shapecat.runs.tables.schemas import FIXED_LISTS, FULL_BOX, TABLES
 
 __all__ = [
-    "AGAIN",
+    "PROCESS_AGAIN",
     "Key",
     "count_rows",
     "first_stamp",
@@ -40,7 +40,7 @@ __all__ = [
     "with_fixed_lists",
 ]
 
-AGAIN = "process the recording again"
+PROCESS_AGAIN = "process the recording again"
 """The remedy in the messages about unreadable tables."""
 _NUMBERS = {"center", "size", "orientation", "posterior", *FULL_BOX}
 """Columns whose numbers are finite."""
@@ -159,14 +159,14 @@ def read_together(
         yield from zip(*groups, strict=True)
     except ValueError as error:  # of zip
         names = ", ".join(columns)
-        msg = f"{folder}: {names} have different row groups; {AGAIN}"
+        msg = f"{folder}: {names} have different row groups; {PROCESS_AGAIN}"
         raise OutputError(msg) from error
 
 
 def misfit(folder: Path) -> OutputError:
     """Return the error for tables of a run whose rows refer to missing rows of other tables."""
     problem = "its tables are inconsistent, as if from different runs"
-    msg = f"{folder}: {problem}; {AGAIN}"
+    msg = f"{folder}: {problem}; {PROCESS_AGAIN}"
     return OutputError(msg)
 
 
@@ -251,11 +251,11 @@ def opened(
     try:
         with _open_parquet(path, read_dictionary) as file:
             if wrong := _wrong_column(file.schema_arrow, TABLES[path.stem], columns):
-                msg = f"{path}: {wrong}; {AGAIN} with --overwrite, which keeps labels"
+                msg = f"{path}: {wrong}; {PROCESS_AGAIN} with --overwrite, which keeps labels"
                 raise OutputError(msg)
             yield file
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
-        msg = f"{path}: not a readable table of a run folder ({error}); {AGAIN}"
+        msg = f"{path}: not a readable table of a run folder ({error}); {PROCESS_AGAIN}"
         raise OutputError(msg) from error
 
 

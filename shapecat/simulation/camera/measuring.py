@@ -131,7 +131,7 @@ def _smoothed(inverse: F8, width: int, limit: float) -> F8:
 
 @kernel
 def _write_depth(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, mesh_ids: I4) -> None:
-    """Add the error, quantize, and write the depth, metres; elsewhere, the mesh id becomes -1.
+    """Add the error, quantize, and write the depth, metres; set mesh ids without depth to -1.
 
     All arrays but ``limits`` are (h, w). ``inverse`` and ``error`` are in 1/m; ``lost`` pixels get
     no depth. ``limits`` (3,): quantization step of the inverse depth (0: none), least and greatest
