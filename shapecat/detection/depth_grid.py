@@ -41,8 +41,8 @@ BORDER_SHARE = 0.12
 """Maximum width of a blank border, as a fraction of the image. A Kinect whose depth is registered
 to its colour image leaves a tenth blank."""
 STRAIGHT_SHARE = 0.3
-"""Minimum fraction of a side over which the samples at the edge of a border extend. They extend
-over less where only the top of a tall object ends a blank area, which is then no border."""
+"""Minimum extent of the samples along the inner edge of a border, as a fraction of the image side.
+If it is less, a blank area ends only at the top of a tall object, and is no border."""
 LARGEST_FACTOR = 16
 STEP_M = 0.004
 """Smallest step between two surfaces, metres. It matters only near the camera, where even a slanted
@@ -87,7 +87,8 @@ def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None
     Parameters
     ----------
     depth : (h, w) metres, 0 where depth is missing.
-    range_m : depths farther away are ignored (thesis 4.2, pass-through filter).
+    camera : the intrinsics of the image.
+    range_m : depths beyond it, or below `NEAREST_M`, are ignored (thesis 4.2, pass-through filter).
     """
     sample = _sampled(depth, 5 if min(depth.shape) > 50 else 1, np.float32(range_m))
     if sample.size == 0:
@@ -137,11 +138,8 @@ def _sampled(depth: F4, step: int, range_m: float) -> F4:
 
 @kernel(inner=True)
 def row_and_column(p: int, columns: int) -> tuple[int, int]:
-    """Return row and column of a flat cell index. A multiplication replaces the slower division.
-
-    ``p`` is ``row * columns + column``.
-    """
-    i = int((p + 0.5) * (1.0 / columns))
+    """Return row and column of the cell with the flat index ``p``: ``row * columns + column``."""
+    i = int((p + 0.5) * (1.0 / columns))  # a multiplication is faster than a division
     return i, p - i * columns
 
 
@@ -174,13 +172,13 @@ def smallest_object_at(grid: DepthGrid, depth_m: F4) -> F4:
 def find_borders(inv_depth: F4, band: int) -> I4:
     """Measure the blank border on each side of the image.
 
-    A border is straight, and no wider than `BORDER_SHARE` of the image.
+    A border is no wider than `BORDER_SHARE` of the image, and its inner edge is straight: the
+    samples there extend over `STRAIGHT_SHARE` of the side.
 
     Parameters
     ----------
     inv_depth : (rows, columns) 1/m.
-    band : number of lines, beginning with the first with a sample, that show whether a border is
-        straight.
+    band : number of lines, from the first that has a sample, whose samples count for the extent.
 
     Returns
     -------
@@ -250,7 +248,7 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, inv_depth: F4)
 
 @kernel(inline=True)
 def _average_two(depth: F4, range_m: float, jump: float, inv_depth: F4) -> None:
-    """Do as `_average` does with a ``factor`` of 2, in a form that vectorises."""
+    """Do the work of `_average` for a ``factor`` of 2, in a form that vectorises."""
     rows, columns = inv_depth.shape
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
     no_depth, min_depth = np.float32(1e9), np.float32(NEAREST_M)

@@ -111,7 +111,10 @@ def detect(
 
 
 def _detect_in_image(depth: F4, camera: Camera, hint: F8 | None, task: Task) -> Scene | None:
-    """Return the scene of a depth image (h, w); ``hint`` is as in `model_planes`."""
+    """Return the scene of a depth image (h, w), metres; None without a supporting plane.
+
+    ``hint`` is as in `model_planes`.
+    """
     range_m = task.settings.max_range_m
     grid = downsample(depth, camera, range_m=range_m)
     segmentation = None if grid is None else _segment(grid, hint, task)
@@ -122,7 +125,10 @@ def _detect_in_image(depth: F4, camera: Camera, hint: F8 | None, task: Task) -> 
 
 
 def _detect_in_cloud(points: F4, hint: F8 | None, task: Task) -> Scene | None:
-    """Return the scene of a cloud (n, 3), metres; ``hint`` is as in `detect`, but a unit vector."""
+    """Return the scene of a cloud (n, 3), metres; None without a supporting plane.
+
+    ``hint`` (3,) is the ``up`` of `detect` as a unit vector.
+    """
     view = virtual_image(points, range_m=task.settings.max_range_m)
     segmentation = None if view is None else _segment_view(view, hint, task)
     if segmentation is None:
@@ -258,7 +264,7 @@ def _clean_up(
     oversegmentation: OverSegmentation,
     settings: DetectionSettings,
 ) -> Segmentation:
-    """Reject structure, fill holes, and measure the objects."""
+    """Reject structure, fill holes, measure the objects; changes ``oversegmentation`` in place."""
     graph, labels, segments = oversegmentation
     features = measure_object_features(grid, model, oversegmentation, settings.max_range_m)
     rejected = find_background(segments, features, grid, settings, structure.load_trees())
@@ -266,7 +272,7 @@ def _clean_up(
     # From here on, labels number the objects.
     filled = np.zeros(labels.shape, np.uint8)
     fill_holes(grid, labels, representatives.size - 1, filled)
-    if model.low_profile.any():  # it may lie at the level of its plane
+    if model.low_profile.any():  # such objects may lie at the level of their plane
         filled |= model.low_profile & (labels > 0)
     plane_ids = segments.plane_id[representatives].astype(np.int64) - 1
     plane_ids[0] = 0

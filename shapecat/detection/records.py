@@ -19,7 +19,7 @@ class PlaneModel(NamedTuple):
     up : (3,) unit vector, sensor frame.
     planes : (planes,) records of `PLANE`, lowest first.
     heights : the plane below each sample, and the height above it.
-    low_profile : (rows, columns) where low-profile objects are.
+    low_profile : (rows, columns) whether a cell is on a low-profile object.
     walls : (rows, columns) uint8, from `remove_walls`; not 0 on walls.
     """
 
@@ -36,7 +36,7 @@ class OverSegmentation(NamedTuple):
     Attributes
     ----------
     graph : the connections and normals of the samples.
-    labels : (rows, columns) int16: 1, 2, ... in the segments, 0 elsewhere.
+    labels : (rows, columns) int16, the number of the segment, from 1; 0 elsewhere.
     segments : the statistics of the segments.
     """
 
@@ -51,10 +51,10 @@ class Segmentation(NamedTuple):
     Attributes
     ----------
     model : the planes, the samples above them, and the walls.
-    labels : (rows, columns) int16: 1, 2, ... count on the objects, 0 elsewhere.
+    labels : (rows, columns) int16, the number of the object, from 1; 0 elsewhere.
     filled : (rows, columns) uint8, 1 where a labelled cell may be at the height of its plane: in a
         filled hole or on a low-profile object.
-    plane_ids : (count + 1,) index in ``model.planes`` of the plane below each object; 0 for
+    plane_ids : (objects + 1,) index in ``model.planes`` of the plane below each object; 0 for
         label 0.
     measured : the boxes, supports and flags of the objects.
     """

@@ -17,7 +17,7 @@ __all__ = ["VirtualImage", "top_view", "virtual_image"]
 WIDEST_SLOPE = 1.5
 """Largest slope x / z or y / z of a point in view."""
 OUTSIDE = 9.0
-"""Placeholder for the slope of a point that is not in view."""
+"""Placeholder for the slope x / z of a point that is not in view."""
 MAX_CELLS = 400_000
 MAX_ROWS = 2000
 MIN_POINTS = 100
@@ -34,7 +34,7 @@ class VirtualImage(NamedTuple):
     points : (n, 3) float32 metres, in the frame of the virtual camera; 0 for points out of view.
     cell : (n,) int32 flat index of each point's cell; -1 for points out of view.
     view_from_sensor : pose of the sensor in the frame of the virtual camera.
-    crowded : fraction of the points that lie well behind another point in their cell.
+    crowded : fraction of the points in view that lie well behind another point in their cell.
     """
 
     grid: DepthGrid
@@ -58,7 +58,7 @@ def virtual_image(points: F4, *, range_m: float, origin: F8 | None = None) -> Vi
     """
     origin = np.zeros(3) if origin is None else origin
     axis, n = _sum_of_directions(points, origin, range_m)
-    if n < MIN_POINTS or np.linalg.norm(axis) < 0.3 * n:  # few, or all around the sensor
+    if n < MIN_POINTS or np.linalg.norm(axis) < 0.3 * n:  # few, or all around the viewpoint
         return None
     rotation = _rotation_to(axis)
     pose = Pose(rotation, -rotation @ origin)
@@ -89,7 +89,7 @@ def top_view(
 
     Returns
     -------
-    The image; None if there are fewer than `MIN_POINTS` points or no plane.
+    The image; None if no plane is found, or for the reasons of `virtual_image`.
     """
     in_range: Bool = np.asarray((np.abs(points) <= range_m).all(axis=1))  # False for NaN
     in_range[in_range] = np.linalg.norm(points[in_range], axis=1) <= range_m
@@ -135,8 +135,8 @@ def _dominant_plane(sample: F8, hint: F8 | None, rng: np.random.Generator) -> F8
 def _sum_of_directions(points: F4, origin: F8, range_m: float) -> tuple[F8, int]:
     """Return the sum (3,) of unit vectors to the points within twice the range, and their number.
 
-    The vectors start at ``origin`` (3,); ``points`` are (n, 3); ``range_m`` is the range; all
-    metres.
+    The vectors start at ``origin`` (3,). ``origin``, ``points`` (n, 3) and ``range_m``, the range,
+    are in metres.
     """
     ax = ay = az = 0.0
     n = 0
@@ -160,7 +160,7 @@ def _to_view(
 
     Writes the points to ``in_view`` (n, 3), their slopes x / z and y / z to ``slopes`` (n, 2), and
     the smallest and largest slopes to ``bounds`` (4,): left, top, right, bottom. Points out of
-    view, or deeper than ``range_m``, metres, get the slope `OUTSIDE`. ``rotation`` (3, 3) and
+    view, or deeper than ``range_m``, metres, get `OUTSIDE` as x / z. ``rotation`` (3, 3) and
     ``translation`` (3,) map ``points`` (n, 3) to that frame.
     """
     r, s = rotation, translation
@@ -189,7 +189,10 @@ def _to_view(
 
 
 def _rotation_to(axis: F8) -> F8:
-    """Return a rotation (3, 3) that turns ``axis`` to +z and keeps +x nearly to the right."""
+    """Return a rotation (3, 3) that turns ``axis`` to +z.
+
+    The new +x is close to the old one or, if ``axis`` is close to the x axis, to the old -y.
+    """
     z = axis / np.linalg.norm(axis)
     x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.8 else np.array([0.0, -1.0, 0.0])
     x = x - (x @ z) * z
@@ -225,7 +228,7 @@ def _render(in_view: F4, slopes: F4, bounds: F8, n: int, pose: Pose) -> VirtualI
 
 
 def _spacing(slopes: F4, bounds: F8, n: int) -> float:
-    """Return the width of a cell, in slope, with which nearly every cell of a surface has a point.
+    """Return the cell width, in slope, at which nearly every cell of a surface has a point.
 
     In a fine grid every point has a cell of its own. Coarser grids are tried until an occupied cell
     holds `POINTS_PER_CELL` points on average. The parameters are as in `_render`.
