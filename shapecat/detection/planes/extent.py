@@ -43,7 +43,7 @@ class SupportingPlane(NamedTuple):
     offset : metres, ``up @ p`` for the points p of the plane.
     extent : (DIRECTIONS,) metres, the support function of the outline: its extent from the sensor
         in evenly spaced directions of the level frame (`gravity_rotation`).
-    area_m2 : visible area.
+    area_m2 : visible area, m².
     """
 
     a: float
@@ -120,9 +120,9 @@ def _ends(inliers: DepthSamples, rows: int, columns: int) -> I4:
 def _extent_of(grid: DepthGrid, plane: F8, normal: F8, ends: I4) -> F8:
     """Return the `SupportingPlane.extent` of a plane, enlarged by `PLANES.margin_m`.
 
-    Perspective keeps a convex outline convex, so only the ends of each row are used, and cells
-    `APART` cells from them if they lie on the plane. ``plane`` (3,) is a, b, c of its inverse
-    depth; ``normal`` (3,) is in the sensor frame; ``ends`` (2, rows) are from `_ends`.
+    Perspective keeps a convex outline convex, so only the ends of each row are used, with those of
+    their neighbours at the distance `APART` that lie on the plane. ``plane`` (3,) is a, b, c of its
+    inverse depth; ``normal`` (3,) is in the sensor frame; ``ends`` (2, rows) are from `_ends`.
     """
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     rows, columns = inv_depth.shape
@@ -162,7 +162,7 @@ def level_coordinates(grid: DepthGrid, mask: Bool, up: F8) -> F8:
 def outline_corners(up: F8, offset: float, extent: F8) -> F8:
     """Return the corners (DIRECTIONS, 3) of the convex outline in order, metres, sensor frame.
 
-    The parameters are as in `SupportingPlane`. ``up`` and ``extent`` are (3,) and (DIRECTIONS,).
+    The parameters are as in `SupportingPlane`.
     """
     # Neighbouring sides x cos + y sin = extent meet at a corner.
     along = (np.roll(extent, -1) - extent * COS[1]) / SIN[1]

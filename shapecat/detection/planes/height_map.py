@@ -167,10 +167,10 @@ def _assign(
 def _bounds(
     line: F4, inv_depth: F4, i: int
 ) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Return the first and last cell of row i with a height, and bounds of their inverse depth.
+    """Return the first and last column with a height in row i, and bounds of the inverse depth.
 
-    ``line`` (columns,) are the heights of the row, `OUT` where there is none; the bounds are the
-    least and the greatest inverse depth, 1/m.
+    ``line`` (columns,) are the heights of the row, `OUT` where there is none. The lower and upper
+    bound, 1/m, hold for all cells of the row that have a height.
     """
     left, right = 0, line.size - 1
     while line[left] <= OUT:

@@ -67,7 +67,7 @@ def _measure_candidates(
 
 
 def _common_up(candidates: list[PlaneCandidate]) -> F8:
-    """Return the mean of the normals, (3,), each weighted by its precision: area * width²."""
+    """Return the mean normal, a unit vector (3,), weighted by precision: area * width²."""
     half = DIRECTIONS // 2
     mean = np.zeros(3)
     for plane, *_ in candidates:

@@ -13,14 +13,16 @@ from shapecat.jit import kernel
 __all__ = ["OrientedPoints", "level_samples", "orient_points"]
 
 STRIDE = 3
-"""Distance between points, and from a point to the neighbours that give its normal, in samples. If
-it is shorter, noise disturbs the normals; if it is longer, narrow boards have no point."""
+"""Distance between points, and from a point to the neighbours that give its normal, in cells. If it
+is shorter, noise disturbs the normals; if it is longer, narrow boards have no point."""
 FIRST = STRIDE // 2
 """First row and column of points."""
 
 
 class OrientedPoints(NamedTuple):
     """Every third row and column of a depth grid, with normals; n = rows * columns, row by row.
+
+    The points at the edge of the grid have neither a normal nor a position: both are 0.
 
     Attributes
     ----------

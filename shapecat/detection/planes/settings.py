@@ -27,14 +27,14 @@ class UpSettings(NamedTuple):
     """Number of directions tried. A direction shared by 1 in 25 normals is missed with a
     probability below 1 %."""
     level_bin_m: float = 0.04
-    """Size of a bin of that histogram, metres: more than the noise at a depth of 2 m, less than the
-    gap between boards."""
+    """Size of a bin of the histogram of heights, metres: more than the noise at a depth of 2 m,
+    less than the gap between boards."""
     level_exponent: float = 0.7
     """Exponent of the weight of large levels in the score of a direction. It is below 1, because a
     camera sees more of the wall behind a counter than of the counter."""
     purity_exponent: float = 2.0
-    """Exponent of the purity in the score of a direction: of the surface that faces the direction,
-    the fraction in large levels."""
+    """Exponent of the purity in the score of a direction: the fraction of the surface facing it
+    that is in large levels."""
     frontal_penalty: float = 0.6
     """Fraction of the score that a direction along the optical axis loses: it is likely the normal
     of a wall."""
@@ -79,18 +79,18 @@ class PlaneSettings(NamedTuple):
     step_m: float = 0.01
     """Length of the steps in which the surroundings of an edge are searched, metres."""
     wall_m: float = 0.03
-    """Samples within this distance behind an edge belong to the wall of a box, metres."""
+    """Samples within this depth of the vertical below an edge are on the wall of a box, metres."""
     wall_share: float = 0.5
     """A plane is the top of a box if more than this fraction of the samples below its edge are on a
     wall."""
     bare_share: float = 0.02
-    """Of the samples inside the outline of a plane with nothing on it, the maximum fraction that is
+    """A plane has nothing on it if less than this fraction of the samples inside its outline is
     higher above it than twice the minimum height of an object."""
     around_m: float = 0.03
     """Distance from a sample of a plane to where its surroundings are examined, metres."""
     drop_ratio: float = 0.2
-    """Around the floor of a bin, the surface drops at fewer places than this fraction of those
-    where it rises."""
+    """Number of places around the floor of a bin at which the surface may drop, relative to the
+    number at which it rises."""
     hidden_m: float = 0.2
     """Maximum width of the part of a bin's floor that objects hide at one side, metres."""
     max_object_m: float = 0.4
@@ -143,8 +143,8 @@ class AssumedSettings(NamedTuple):
     """Depth up to which such samples may be objects that hide their support, metres; farther away
     they are background."""
     unexplained: float = 0.2
-    """Fraction of unexplained samples above which a plane is assumed. If a table is in plain view,
-    the fraction is at most 0.06."""
+    """A plane is assumed if more than this fraction of the samples is unexplained. If a table is in
+    plain view, the fraction is at most 0.06."""
     noise_share: float = 0.01
     """Fraction of the unexplained samples that may lie below the plane, as noise."""
 

@@ -53,8 +53,9 @@ def may_have_strips(
 def _may_be_strips(
     grid: DepthGrid, candidates: list[PlaneCandidate], height: float, above: float
 ) -> bool:
-    """Return whether a plane at a height is seen at a grazing angle, or covered by objects.
+    """Return whether a plane at a height may be seen as strips: at a grazing angle, or covered.
 
+    The former is ruled out by a large candidate at its height, the latter also by one below it.
     ``height`` is above the sensor, metres; ``above`` is the level area just above the plane,
     relative to the area of the plane, as `_peaks` yields it. ``candidates`` are parallel planes.
     """
@@ -72,8 +73,8 @@ def add_strip_planes(grid: DepthGrid, candidates: list[PlaneCandidate]) -> list[
 
     Hardly any surface lies just below such a plane. A board shows some surface at its own height; a
     covered table shows more just above, on the objects that cover it. ``candidates`` are parallel
-    planes, lowest first, at least one. The result is in the same order. In it, a given plane at the
-    height of the strips may have a larger extent, or be replaced.
+    planes, lowest first, at least one. The result is in the same order; a candidate at the height
+    of strips may be extended or replaced.
     """
     up = max(candidates, key=lambda candidate: candidate.plane.area_m2).plane.up
     strips, area = _level_strips(grid.inverse_depth, grid.intrinsics, up)
@@ -108,7 +109,7 @@ def _is_at_range_end(inv_depth: F4, strips: DepthSamples) -> bool:
 
 
 def _widened(candidate: PlaneCandidate, table: PlaneCandidate) -> PlaneCandidate:
-    """Return ``candidate``, extended to cover ``table`` as well, with its covered area."""
+    """Return ``candidate`` with the covered area of ``table``, and extended to its outline."""
     extent = np.maximum(candidate.plane.extent, table.plane.extent)
     plane = candidate.plane._replace(extent=extent)
     return candidate._replace(plane=plane, covered_m2=table.covered_m2)
@@ -129,7 +130,7 @@ def _plane_at(grid: DepthGrid, strips: F4, up: F8, height: float) -> PlaneCandid
 def _covered(
     candidate: PlaneCandidate, strips: F4, intrinsics: PinholeIntrinsics
 ) -> PlaneCandidate:
-    """Return the candidate with its covered area, which is 0 if most of the outline is visible.
+    """Return the candidate with its covered area: 0 if the outline is mostly visible or uncovered.
 
     ``strips`` (4, n) are from `_level_strips`.
     """
@@ -146,7 +147,7 @@ def _covered(
 def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane) -> float:
     """Return the area, m², of the level surfaces above a plane and within its outline.
 
-    They are `STRIPS.same_m` to `STRIPS.tallest_m` above it. ``strips`` (4, n) are from
+    Only those `STRIPS.same_m` to `STRIPS.tallest_m` above it count. ``strips`` (4, n) are from
     `_level_strips`.
     """
     subset = strips[:, ::AREA_STRIDE]
@@ -234,7 +235,7 @@ def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple
 
 @kernel(fast=True, inner=True)
 def _find_level(inv_depth: F4, i: int, slope: tuple[float, float, float], level: Bool) -> None:
-    """Mark the cells of row i that are on level surface; the loop vectorises.
+    """Mark the cells of row i that are on level surface. The loop vectorises.
 
     ``slope`` is the rise, along up, of the row's rays at depth 1: in column 0, and its change per
     column and per row. ``level`` (columns,) is written.

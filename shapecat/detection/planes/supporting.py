@@ -28,7 +28,7 @@ STEPS_TO_EDGE = 5
 STEPS_DOWN = 20
 """Maximum number of steps down from the edge of a plane."""
 EDGE_CELLS = 2
-"""Number of cells in which an edge is blurred."""
+"""Number of cells over which an edge is blurred."""
 MIN_BELOW = 20
 """Minimum number of samples below an edge from which to decide what is there."""
 COUNT_STRIDE = 2
@@ -92,7 +92,7 @@ def supporting_planes(
 def _is_top(
     grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane, drop: float, area_m2: float
 ) -> bool:
-    """Return whether a plane is the top of an object or of several, by rules 6 to 9.
+    """Return whether a plane is the top of one or more objects: rules 6 to 9.
 
     ``inliers`` are the samples of the plane, ``drop`` is its height above the next plane below,
     metres, and ``area_m2`` counts the covered area too.
@@ -110,7 +110,7 @@ def _is_top(
 
 
 def _overlaps(lower: SupportingPlane, upper: SupportingPlane) -> bool:
-    """Return whether the middle (Steiner point) of a plane is over the outline of another."""
+    """Return whether the middle (Steiner point) of ``upper`` is above the outline of ``lower``."""
     x, y = upper.extent @ COS * 2 / DIRECTIONS, upper.extent @ SIN * 2 / DIRECTIONS
     return bool(np.all(COS * x + SIN * y < lower.extent))
 
@@ -239,10 +239,10 @@ def _count_below_edge(
 
 @kernel(inline=True)
 def _blurred_steps(fx: float, plane: SupportingPlane, x: float, y: float, z: float) -> int:
-    """Return the number of steps below an edge that look the same as the surface beyond it.
+    """Return the number of steps below an edge that are hidden in its blur.
 
-    ``x``, ``y``, ``z`` are a point of the edge, metres, sensor frame; ``fx`` is in cells. Seen
-    from above, the side below an edge covers few cells, and the edge is blurred.
+    ``x``, ``y``, ``z`` are a point of the edge, metres, sensor frame; ``fx`` is in cells. The more
+    the side below an edge is seen from above, the fewer cells it covers.
     """
     up, distance2 = plane.up, x * x + y * y + z * z
     height = x * up[0] + y * up[1] + z * up[2]

@@ -19,8 +19,8 @@ MAX_DIRECTIONS = 4
 NORMALS_PER_BLOCK = 512
 """Number of normals after which a direction that can no longer win is dropped."""
 GRAZING_COS = 0.1
-"""Lower bound of the cosine between a normal and a ray, from which the area of a point is computed.
-At more grazing angles, noise would determine the area."""
+"""Lower bound of the cosine between a normal and a ray in the computation of a point's area. At
+more grazing angles, noise would determine the area."""
 
 
 @kernel
@@ -63,9 +63,9 @@ def estimate_up(
 
 @kernel(inline=True)
 def _every_second(points: OrientedPoints, intrinsics: PinholeIntrinsics) -> F4:
-    """Return normals, positions, weights and areas (8, n) of every second point, for speed.
+    """Return the normal, position, weight and area (8, n) of every second point, for speed.
 
-    Positions are in metres, areas in m2.
+    Points without a normal are left out. Positions are in metres, areas in m2.
     """
     normals, positions = points.normals, points.positions
     surface = np.zeros((8, normals.shape[1] // 2 + 1), np.float32)
@@ -84,7 +84,7 @@ def _every_second(points: OrientedPoints, intrinsics: PinholeIntrinsics) -> F4:
 
 @kernel(inline=True)
 def _bins_of(surface: F4) -> int:
-    """Return how many bins of `UpSettings.level_bin_m` cover the heights of all points (8, n)."""
+    """Return how many `UpSettings.level_bin_m` cover the distances of all points (8, n)."""
     farthest2 = 0.0
     for k in range(surface.shape[1]):
         x, y, z = surface[3, k], surface[4, k], surface[5, k]
@@ -129,9 +129,9 @@ def _select(normals: F4, direction: F8, bounds: tuple[float, float]) -> F4:
 
 @kernel(inline=True)
 def _ransac_direction(normals: F4, trials: F8, best: F8) -> int:
-    """Write the direction near which most normals (3, n) are to ``best`` (3,); return their number.
+    """Find the direction with the most normals (3, n) near it; return the number of these normals.
 
-    ``trials`` are from `draw_trials`.
+    The direction is written to ``best`` (3,). ``trials`` are from `draw_trials`.
     """
     n, best_count = normals.shape[1], 0
     direction = np.zeros(3)
@@ -231,7 +231,7 @@ def _score(surface: F4, direction: F8, bins: int, roll_penalty: float) -> float:
 
 @kernel(inline=True)
 def _large_levels(count: F8, areas: F8, min_weight: float) -> tuple[float, float, float]:
-    """Sum, over the levels heavier than ``min_weight``, weights, squared weights, and areas (m2).
+    """Sum weights, squared weights and areas (m2) over the levels heavier than ``min_weight``.
 
     ``count`` and ``areas`` (bins,) are the weights and the areas, m2, at each height. A level fills
     two bins and has more weight than its neighbours; slanted surfaces have no such peaks.
