@@ -52,7 +52,8 @@ def fill_hull(residual: F4, part: I4, cells: I4, count: int) -> int:
 def _straighten(side: F8, first: int, last: int) -> None:
     """Replace one side of an outline with the same side of its convex hull, in place.
 
-    ``side`` (rows,) is the column of the outline in each row, from row ``first`` to ``last``.
+    ``side`` (rows,) is the column of the outline in each row from ``first`` to ``last``, negated if
+    it is the right side.
     """
     corners = np.zeros(side.size, np.int32)
     n = 0

@@ -77,8 +77,9 @@ def _find_low(
 ) -> bool:
     """Write the low cells of row ``i``: their inverse depth relative to the plane, and a mark of 1.
 
-    ``raw`` and ``mark`` (3, columns) hold both for the last three rows, and 0 in the other cells.
-    Returns whether the row has low cells. The other parameters are as in `measure_residual`.
+    ``raw`` and ``mark`` (3, columns) hold both for the last three rows, row ``i`` at ``i % 3``, and
+    0 in the other cells. Returns whether the row has low cells. The other parameters are as in
+    `measure_residual`.
     """
     plane_id, height = heights
     zero, one, low = np.float32(0), np.float32(1), np.float32(LOW.low_m)

@@ -105,8 +105,8 @@ def find_low_profile(
 def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
     """Return the first row of the cells of a plane, and one past the last, with a margin.
 
-    The two are equal if there is no cell. ``plane_id`` and ``number``, from 1, are as in
-    `HeightMap`. All neighbours that are read lie within the margin.
+    Both are 0 if there is no cell. ``plane_id`` and ``number``, from 1, are as in `HeightMap`. The
+    margin holds all neighbours that the search for low-profile objects reads.
     """
     rows = plane_id.shape[0]
     above, on = np.int8(number), np.int8(-number)
@@ -120,9 +120,8 @@ def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
     if end == 0:
         return 0, 0
     start = max(start - LOW.rise_cells, 0)
-    return start - start % NOISE_STRIDE, min(
-        end + LOW.rise_cells, rows
-    )  # noise is measured on the same rows
+    # Noise is measured on the same rows as in the whole image.
+    return start - start % NOISE_STRIDE, min(end + LOW.rise_cells, rows)
 
 
 @kernel(inner=True)

@@ -10,7 +10,8 @@ class LowProfileSettings(NamedTuple):
 
     levels: tuple[float, ...] = (3.0, 2.0, 1.3, 0.9, 0.6)
     """Thresholds above the local mean, as multiples of `Limits.unit`. The outlines of the parts
-    above each are tested: one threshold separates an object from the depth error beside it."""
+    above each threshold are tested: one of them separates an object from the depth error around
+    it."""
     fine: float = 0.006
     """Upper bound of `Limits.unit`, 1/m: larger rises come not from noise but from a plane at a
     grazing angle."""
@@ -70,7 +71,7 @@ class OutlineSettings(NamedTuple):
     min_sides: int = 30
     """Minimum number of sides that face the plane; fewer prove nothing."""
     table_share: float = 0.4
-    """Minimum fraction of the sides that face the plane."""
+    """Minimum fraction of all sides that face the plane."""
     bounded_share: float = 0.65
     """Minimum fraction of bounded sides among those that are not hidden."""
     broad: float = 1.5

@@ -42,8 +42,8 @@ def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, max_size_m: float, trial
     Returns
     -------
     (rows, columns) uint8: `CLEARED` where cells were removed, `ON_WALL` in the other parts of such
-    a wall, 0 elsewhere. A plane with less than `WALLS.cleared_m2` to clear, as through the fronts
-    of many objects, gets no marks.
+    a wall, 0 elsewhere. A plane with less than `WALLS.cleared_m2` to clear, such as one through the
+    fronts of many objects, gets no marks.
     """
     walls = np.zeros(plane_id.shape, np.uint8)
     samples = sample_grid(grid.inverse_depth, plane_id)
@@ -89,7 +89,7 @@ def _is_wall(
 def _measure(
     intrinsics: PinholeIntrinsics, samples: DepthSamples, plane: F8, normal: F8, up: F8, strips: F8
 ) -> float:
-    """Return the area of the inliers of a plane, m², and add it to the strips they lie in.
+    """Return the area of the inliers of a plane, m²; add each inlier's area to its strips.
 
     ``strips`` (2, STRIPS) are the areas in vertical and in level strips; the other parameters are
     as in `_is_wall`.
@@ -115,7 +115,7 @@ def _measure(
 def _clear(
     grid: DepthGrid, plane_id: I4, plane: F8, axes: F8, max_size_m: float, walls: U1
 ) -> None:
-    """Clear the large connected parts of a wall; other parts may be objects in front of it.
+    """Clear the large connected parts of a wall; other parts may be objects in its plane.
 
     ``axes`` (3, 3) are the normal of the wall, the horizontal direction along it, and up. ``plane``
     (3,) is a, b, c of the wall's inverse depth. ``walls`` and, in cleared cells, ``plane_id`` are
