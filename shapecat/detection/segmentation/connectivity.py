@@ -19,7 +19,7 @@ from shapecat.jit import kernel, unset
 __all__ = ["SurfaceGraph", "connect_surfaces"]
 
 BENT = 4
-"""The bit of a link times this is a temporary mark: only a local plane supports the link."""
+"""Factor from the bit of a link to a temporary bit: only a local plane supports this link."""
 MIN_CHORD = 3e-4
 """Squared distance between two unit normals at an angle of one degree."""
 
@@ -33,8 +33,8 @@ class SurfaceGraph(NamedTuple):
     Attributes
     ----------
     local_plane : (rows, 3, columns) float32, inverse depth of the fitted plane at the cell, and its
-        change per column and per row; 0 in object cells without a fit. In the other cells, the
-        inverse depth is 0 near object cells; the rest is uninitialised.
+        change per column and per row; 0 in object cells without a fit. Outside object cells, the
+        inverse depth is 0 near them, and everything else is uninitialised.
     normal : (rows, 3, columns) float32 unit normal towards the camera, sensor frame; 0 in object
         cells without a fit, uninitialised elsewhere.
     links : (rows, columns) uint8, `RIGHT` and `DOWN` where the surface continues to that neighbour.
@@ -113,9 +113,10 @@ def _part_steps(grid: DepthGrid, plane_id: I4, i: int, start: int, end: int, lin
 
     At a step the depths change more from one cell to the next than before and after it. A plane
     fitted to a window that spans the step treats it as a slope, so that a plate would be linked
-    with the can it stands on. At the edge of a surface seen at a grazing angle, only one side has
-    the slope. The object cells of row ``i`` are from column ``start`` to before ``end``;
-    ``plane_id`` is as in `HeightMap`, ``links`` as in `SurfaceGraph`.
+    with the can it stands on. A link stays if one side has that slope too, as at the edge of a
+    surface seen at a grazing angle. The object cells of row ``i`` are from column ``start`` to
+    before ``end``; ``plane_id`` is as in `HeightMap`, ``links`` as in `SurfaceGraph`, but with the
+    bits of `BENT`, which are cleared.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     any_bent = False
@@ -154,7 +155,7 @@ def _link_run(
     bit: int,
     links: U1,
 ) -> None:
-    """Link a run of cells with their neighbours on one side; this vectorises.
+    """Link a run of cells with their neighbours on one side. The loop vectorises.
 
     Parameters
     ----------
@@ -164,7 +165,7 @@ def _link_run(
         cells.
     steps : index offsets from a cell to its neighbour, from its local plane to the neighbour's, and
         from the inverse depth of a local plane to its slope in that direction.
-    bit : `RIGHT` or `DOWN`.
+    bit : `RIGHT` or `DOWN`; ``links`` also gets the bits of `BENT`.
     """
     zero = np.float32(0)
     cell, fit, step = np.uint64(run[0]), np.uint64(run[1]), np.uint64(steps[0])

@@ -65,10 +65,10 @@ def padded(start: int, end: int) -> int:
 
 @kernel(inline=True)
 def _write(fits: F4, planes: F4, normals: F4, start: int, columns: int, n: int) -> None:
-    """Copy the fits of a run to the local planes and normals, beginning at index ``start``.
+    """Copy the fits of a run of ``n`` cells, from `_fit_run`, to the local planes and normals.
 
-    ``fits`` is from `_fit_run` for ``n`` cells; ``planes`` and ``normals`` are as in
-    `fit_local_planes`, flattened. Slices and signed indices would be slower.
+    ``planes`` and ``normals`` are as in `fit_local_planes`, flattened; ``start`` is the index of
+    the run in them, ``columns`` the width of the grid. Slices and signed indices would be slower.
     """
     for d in range(3):
         target, plane = np.uint64(start + d * columns), np.uint64(d * PITCH)
@@ -104,10 +104,10 @@ def _copy_windows(
 ) -> None:
     """Copy the rows around a run, and `WINDOW` cells beyond its ends, to ``values``.
 
-    Writes `NONE` for cells above other planes. ``run`` is the row of the run, its first column, and
-    one past its last. ``depths`` and ``plane_ids`` (rows * columns,) are inverse depth and
-    `HeightMap.plane_id`, flattened from ``shape``; ``values`` (SIDE * PITCH,) holds one row after
-    the other.
+    Writes inverse depth, or `NONE` for cells that are not above the plane of the run. ``run`` is
+    the row of the run, its first column, and one past its last. ``depths`` and ``plane_ids`` (rows
+    * columns,) are inverse depth and `HeightMap.plane_id`, flattened from ``shape``; ``values``
+    (SIDE * PITCH,) holds one row after the other.
     """
     rows, columns = shape
     i, start, end = run

@@ -1,7 +1,7 @@
 """Split at width changes: stacked objects with flush fronts, where the outline has a step.
 
 Where a wider or narrower object begins, both sides of the outline step in or out, even if the
-fronts are one surface. The ends of a cup's handle look the same; merging joins its parts again.
+fronts are one surface. The ends of a cup's handle look like such a step; merging undoes the split.
 """
 
 from typing import NamedTuple
@@ -69,7 +69,7 @@ def split_at_width_changes(
 def _relabel_above(
     labels: I4, spans: I4, height: F4, label: int, level: float, new_label: int
 ) -> None:
-    """Give the cells of a label that are higher than ``level``, metres, ``new_label``, in place.
+    """Set the cells of ``label`` that are higher than ``level``, metres, to ``new_label``.
 
     ``labels`` (rows, columns) are 0 outside ``spans``; ``height`` (rows, columns) is in metres.
     """
@@ -141,9 +141,10 @@ def _find_cuts(outlines: Outlines, p: int, cuts: Bool) -> bool:
 
 @kernel(inline=True)
 def _step_at(outlines: Outlines, p: int, band: int) -> float:
-    """Return by how much both sides of label p together step at the lower edge of a band, metres.
+    """Return the sum of the steps of both sides of label p at the lower edge of a band, metres.
 
-    The result is 0 unless one side steps by at least `SegmentationSettings.side_step_m`.
+    The result is 0 unless one side steps by at least `SegmentationSettings.side_step_m`; the other
+    side counts from half of that.
     """
     total = largest = 0.0
     for k in range(2):
@@ -157,7 +158,7 @@ def _step_at(outlines: Outlines, p: int, band: int) -> float:
         if not abs(change) < np.inf:
             continue
         sign = np.float32(1 if change > 0 else -1)
-        # A slope continues from one of the two sides.
+        # A slope below or above the step continues across it.
         slope = max(sign * _slope_of(end, low), sign * _slope_of(end, high), 0.0)
         step = -_second(end, high, -sign) - _second(end, low, sign) - BANDS_BESIDE * slope
         if step >= SEGMENTATION.side_step_m / 2:
