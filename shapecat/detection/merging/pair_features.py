@@ -46,7 +46,7 @@ _ADJACENCY = np.dtype(
         ("contact", "f4"),  # fractions of the border: where the surface continues,
         ("first_in_front", "f4"),  # and where one is in front
         ("second_in_front", "f4"),
-        ("along_first", "f4"),  # fractions of the boundary of each that is in contact
+        ("along_first", "f4"),  # fractions of the boundary of each at the depth of the other
         ("along_second", "f4"),
         ("second_faces_up", "f4"),  # fractions of the contact beyond which the other faces up
         ("first_faces_up", "f4"),
@@ -60,15 +60,15 @@ _ADJACENCY = np.dtype(
 """Features of the border between two segments."""
 _RELATION = np.dtype(
     [
-        ("area_ratio", "f4"),
+        ("area_ratio", "f4"),  # of the first to the second
         ("width_ratio", "f4"),
         ("lateral_distance", "f4"),  # divided by the larger width
         ("depth_difference_m", "f4"),
         ("depth_difference", "f4"),  # divided by the larger width
         ("overlap", "f4"),  # of the lateral ranges, divided by the smaller width
-        ("top_over_top_m", "f4"),
+        ("top_over_top_m", "f4"),  # heights of the first above the second
         ("bottom_over_top_m", "f4"),
-        ("other_bottom_over_top_m", "f4"),
+        ("other_bottom_over_top_m", "f4"),  # height of the second above the first
         ("bottom_over_bottom_m", "f4"),
         ("most_beyond_m", "f4"),  # extent of the first beyond the sides of the second
         ("least_beyond_m", "f4"),
@@ -82,7 +82,7 @@ _RELATION = np.dtype(
         ("both_convexity", "f4"),
         ("hull_growth", "f4"),  # area of the hull of both divided by the sum of each hull's area
         ("cells", "f4"),  # of the first
-        ("cell_m", "f4"),
+        ("cell_m", "f4"),  # width of a cell at the depth of the first
         ("down", "f4"),  # cosine between the optical axis and up
     ],
     align=True,
@@ -98,8 +98,8 @@ PAIR_FEATURES = np.dtype(
     align=True,
 )
 """The features of two segments, the one with the smaller area first; all are float32, lengths in
-metres or ratios. The trees index them in this order. All pairs of a frame use the same record, so
-each pair must write every field."""
+metres. The trees index them in this order. All pairs of a frame use the same record, so each pair
+must write every field."""
 
 
 class ViewGeometry(NamedTuple):
@@ -117,9 +117,9 @@ class ViewGeometry(NamedTuple):
 
 @kernel
 def find_adjacent(segments: Segments, p: int, view_geometry: ViewGeometry) -> Bool:
-    """Return which segments may be one object with segment ``p``: (n + 1,) bool.
+    """Return which segments may belong to the same object as segment ``p``: (n + 1,) bool.
 
-    Such a segment is above the same plane as ``p``, and is near ``p`` or touches, occludes or faces
+    Such a segment is above the same plane as ``p``, and touches, faces or occludes ``p``, is near
     it, or is occluded by it.
     """
     pairs, parent, plane_id = segments.pairs, segments.parent, segments.plane_id
@@ -160,7 +160,7 @@ def _face(segments: Segments, p: int, q: int, view_geometry: ViewGeometry) -> bo
 
 @kernel(inner=True)
 def _distance(a: Row, b: Row) -> float:
-    """Return the distance between the mean positions of two segments, metres."""
+    """Return the distance between the mean positions of two `SEGMENT` records, metres."""
     (x, y, z), (u, v, w) = _mean_position(a), _mean_position(b)
     return math.sqrt((x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2)
 
@@ -180,9 +180,9 @@ def pair_features(
 def write_pair_features(
     segments: Segments, features: Records, p: int, q: int, view_geometry: ViewGeometry, out: Row
 ) -> None:
-    """Write the features of segments ``p`` and ``q`` to ``out``.
+    """Write the `PAIR_FEATURES` of segments ``p`` and ``q`` to the record ``out``.
 
-    ``features`` (n + 1,) are the `SEGMENT_FEATURES` of single segments.
+    ``features`` (n + 1,) are the `SEGMENT_FEATURES` of all segments.
     """
     area_p, area_q = segments.statistics[p].area, segments.statistics[q].area
     if area_p > area_q or (area_p == area_q and p > q):
@@ -230,7 +230,10 @@ def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) 
 
 @kernel(inner=True)
 def _above_top(segments: Segments, p: int, q: int) -> float:
-    """Return the mean height, above the top of ``q``, at which ``p`` rests on ``q``, metres."""
+    """Return the mean height, above the top of ``q``, at which ``p`` rests on ``q``, metres.
+
+    Return `MERGING.no_contact_m` if it does not rest on ``q``.
+    """
     contact = segments.pairs[p, q].rests_on
     if contact == 0:
         return MERGING.no_contact_m
@@ -239,7 +242,7 @@ def _above_top(segments: Segments, p: int, q: int) -> float:
 
 @kernel(inline=True)
 def _write_relation(a: Row, b: Row, out: Row) -> None:
-    """Write the features of two `SEGMENT` records, apart from their border, to ``out``."""
+    """Write the fields of a `_RELATION` that compare two `SEGMENT` records to ``out``."""
     width_a, width_b = width_of(a), width_of(b)
     max_width = max(width_a, width_b)
     left, right = b.left - a.left, a.right - b.right

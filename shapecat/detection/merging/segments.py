@@ -34,7 +34,7 @@ SEGMENT = np.dtype(
         ("bottom", "f4"),  # and height above the plane, metres
         ("right", "f4"),  # maxima of both
         ("top", "f4"),
-        ("count", "f4"),  # the remaining fields are sums: cells
+        ("count", "f4"),  # number of cells; this and the remaining fields are sums
         ("boundary", "f4"),  # sides of cells on the boundary
         ("area", "f4"),  # of the visible surface, m2
         ("depth_sum", "f4"),

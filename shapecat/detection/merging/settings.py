@@ -13,8 +13,8 @@ class MergingSettings(NamedTuple):
     """Minimum cosine between up and the normal of an upward-facing surface: noise turns normals by
     up to 35 degrees."""
     edge_on_cos: float = 0.2
-    """Lower bound of the cosine between a normal and the line of sight, from which an area is
-    computed: below it, noise dominates."""
+    """Lower bound of the cosine between a normal and the line of sight in the computation of areas:
+    below it, noise dominates."""
     flat_deg: int = 20
     """Largest concave angle, degrees, of a sample of a segment; others are too near an edge."""
     gap_cells: int = 3
@@ -50,7 +50,7 @@ class MergingSettings(NamedTuple):
     coplanar_cos: float = math.cos(math.radians(15))
     """Minimum cosine between the normals of the samples (15 degrees)."""
     partner_share: float = 0.45
-    """Minimum fraction of the samples of either segment that continue the other; on round objects,
+    """Minimum fraction of the samples of each segment that continue the other; on round objects,
     half of them do."""
     min_samples: int = 4
     """Minimum number of samples that describe the surface of a segment."""
