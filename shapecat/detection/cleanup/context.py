@@ -31,8 +31,9 @@ CONTEXT_FEATURES = np.dtype(
 def measure_borders(segments: Segments, roots: I4) -> F4:
     """Return the lengths of the borders between all pairs of the segments ``roots`` (r,).
 
-    The result (4, r, r), in cells, holds the four kinds of border: the two are connected, the
-    second is behind the first, the second is in front, and the two are near but not connected.
+    The result (4, r, r), in sides of cells, holds the four kinds of border: the two are connected,
+    the second is behind the first, the second is in front, and the two are near but not connected.
+    The first and the last kind count each side twice.
     """
     index = np.ix_(roots, roots)
     contact, in_front, near = (segments.pairs[n][index] for n in ("contact", "in_front", "near"))

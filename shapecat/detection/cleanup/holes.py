@@ -88,13 +88,13 @@ def _count_sides(
     total: I4,
     area: I4,
 ) -> None:
-    """Count, in place, the cells of the holes 1..n - 1, and their sides on the boundary.
+    """Count, in place, the cells of the holes 1..n - 1, and the sides of cells on their boundary.
 
     ``sides`` (n, labels, 3) holds the counts `BOUNDARY`, `IN_FRONT` and `CONTINUOUS` of the sides
     with each label; ``total`` (n,) also counts sides without a label. ``area`` (n,) counts cells.
     ``inside`` and ``spans`` are from `_between_labels`; ``component`` (rows, columns) is the hole
-    of each cell inside. From each side, cells without depth are skipped and added to the area; the
-    label beyond them is the neighbour.
+    of each cell inside. Cells without depth beyond a side are skipped: the label after them counts,
+    and they are added to the area, once for each such side.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     for i in range(len(spans)):
@@ -119,7 +119,7 @@ def _count_sides(
 
 @kernel(inline=True)
 def _count_label_cells(labels: I4, spans: I4, area: I4) -> None:
-    """Count the cells of each label in ``area`` (labels,); ``spans`` are from `_between_labels`."""
+    """Add up the cells of each label in ``area`` (labels,); ``spans`` is from `_between_labels`."""
     for i in range(len(spans)):
         for j in range(spans[i, 0], spans[i, 1]):
             area[labels[i, j]] += 1

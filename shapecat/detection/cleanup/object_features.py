@@ -65,8 +65,8 @@ OBJECT_FEATURES = np.dtype(
     [("segment", SEGMENT_FEATURES), ("surroundings", _SURROUNDINGS), ("visibility", _VISIBILITY)],
     align=True,
 )
-"""The features of a segment that may be an object; all are float32, lengths in metres or ratios.
-The trees index them in this order."""
+"""The features of a segment that may be an object; all are float32, lengths in metres. The trees
+index them in this order."""
 
 
 def measure_object_features(
@@ -117,7 +117,7 @@ def _measure(
     limits: ViewLimits,
     out: Records,
 ) -> None:
-    """Write the features of the segments that were not merged into another."""
+    """Write the features of the segments that were not merged into another to ``out`` (n + 1,)."""
     segments, down = oversegmentation.segments, model.up[2]
     near_plane = _count_by_segment(grid, model, oversegmentation, limits, out)
     for p in range(1, segments.parent.size):
@@ -172,7 +172,7 @@ def _count_by_segment(
                 continue
             p, w = owner[labels[i, j]], inv_depth[i, j]
             row = out[p].surroundings
-            # Most of these are rare: a branch is faster than to add 0.
+            # Most of these are rare: a branch is faster than adding 0.
             if i in (top, bottom) or j in (left, right):
                 row.image_border += 1
             if w < last:

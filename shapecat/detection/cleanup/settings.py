@@ -9,11 +9,11 @@ class CleanupSettings(NamedTuple):
     """Constants for rejecting structure and completing labels."""
 
     min_logit: float = 0.0
-    """Minimum logit of an object, which is then more likely than structure. Of the segments between
-    -1 and 0 that cover less than `large_share` of the image, a fifth are objects."""
+    """Minimum logit of an object, which is then more likely than structure. Of the segments with
+    logits between -1 and 0 that cover less than `large_share` of the image, a fifth are objects."""
     min_large_logit: float = -1.0
-    """Minimum logit of an object that covers more than `large_share` of the image. Of the segments
-    that do, two thirds of those between -1 and 0 are objects."""
+    """Minimum logit of an object that covers more than `large_share` of the image. Of such segments
+    with logits between -1 and 0, two thirds are objects."""
     far_m: float = 2.0
     """Depth beyond which most segments are background, metres."""
     min_far_logit: float = 1.0
@@ -37,8 +37,8 @@ class CleanupSettings(NamedTuple):
     """Minimum fraction of the image covered by a large object, an arm, furniture or the bent end of
     a table."""
     cut_share: float = 0.4
-    """Fraction of the perimeter of a large segment at the image border above which it is an arm or
-    furniture. The perimeter is that of a square with the same number of cells."""
+    """A large segment is an arm or furniture if more than this fraction of its perimeter is at the
+    image border. The perimeter is that of a square with the same number of cells."""
     enclosed_share: float = 0.6
     """Minimum fraction of the boundary of a hole that has the label of the object around it. For a
     ring seen from the side it is about this, for the gap between two objects a half."""
