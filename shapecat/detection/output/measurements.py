@@ -116,7 +116,7 @@ def _extend_to_planes(boxes: Boxes, standing: Bool, up: F8, plane_offsets: F8) -
 
 @kernel
 def _find_supports(segments: Segments, representatives: I4, boxes: Boxes, up: F8) -> tuple[I4, F8]:
-    """Return the label below each object (n,), 0 for its plane; and the height there, metres.
+    """Return the label below each object, 0 for its plane, and the height there, metres: (n,) each.
 
     Object A stands on object B if A is over B, and has more contact with the upward-facing surface
     of B than with the plane. If that contact is hidden, the bottom of A must be at the top of B.
@@ -197,7 +197,7 @@ def _supporting_object(
 
 @kernel(inline=True)
 def _hidden_support(segments: Segments, representatives: I4, p: int, below: Bool) -> int:
-    """Return the label that has the most contact with segment ``p`` from below; 0 if there is none.
+    """Return the label below segment ``p`` with the longest border to it; 0 if there is none.
 
     A segment that lies mostly below the top of an object is not on the object, but behind it. The
     parameters are as in `_supporting_object`.
@@ -251,7 +251,7 @@ def _measure_boxes(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> None
 
 @kernel(fast=True, inline=True)
 def _outer_points(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> tuple[F4, I4]:
-    """Return points of each object in the level frame (3, n), and the index where each begins.
+    """Return points (3, n) of the objects, level frame, and the index where each object begins.
 
     The points are the outermost cells, and the cells inside at every 4th row and column, since the
     nearest point of a ball is inside its outline. Also writes ``boxes.low`` and ``boxes.high``. The
@@ -297,8 +297,8 @@ def _outer_points(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> tuple
 def _find_outer(labels: I4, i: int, first: int, end: int, outer: Bool) -> None:
     """Mark the labelled cells in part of row ``i`` that are next to other labels.
 
-    In every 4th row, every 4th labelled cell is marked too. ``labels`` is (rows, columns); the part
-    is from column ``first`` to before ``end``; the marks go to ``outer`` (columns,).
+    Labelled cells in every 4th row and column are marked too. ``labels`` is (rows, columns); the
+    part is from column ``first`` to before ``end``; the marks go to ``outer`` (columns,).
     """
     rows, columns = labels.shape
     if i == 0 or i == rows - 1:

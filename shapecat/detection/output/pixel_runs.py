@@ -28,7 +28,7 @@ def pixels_by_label(runs: I4, labels: int) -> tuple[U4, I4]:
     """Return the pixel indices (n,) of runs, sorted by label, and where each label ends (labels,).
 
     ``runs`` is (r, 3): label, first pixel, and one past the last. ``labels`` is the number of
-    labels, with label 0, which has no pixels: its end is 0.
+    labels, including label 0, which has no pixels: its end is 0.
     """
     offset, total = np.zeros(labels, np.int64), 0  # where the next pixel of each label goes
     for r in range(len(runs)):

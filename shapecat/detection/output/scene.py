@@ -100,7 +100,7 @@ def _select_objects(
     """Return which lists in ``indices`` have enough points, in the order of their first points.
 
     ``indices`` are the pixels or points of each label; ``image`` says whether they are pixels.
-    Those of an object are at least ``min_points`` and, in an image, cover
+    Enough are at least ``min_points`` and, in an image, the pixels of
     `ObjectMeasurements.min_cells`.
     """
     limits = [float(min_points)] * len(indices)
@@ -155,8 +155,8 @@ def _at_image_border(grid: DepthGrid, segmentation: Segmentation, _: Pose) -> Bo
 def _at_view_border(grid: DepthGrid, segmentation: Segmentation, sensor_from_view: Pose) -> Bool:
     """Return whether each object reaches the border of the sensor's view, for a point cloud.
 
-    Such a border is a long straight side of the cloud as seen from the sensor. A cloud fused from
-    several views has none.
+    Such a border is a long straight side of the cloud as seen from the sensor. If the virtual
+    camera is elsewhere (`top_view`), none is searched for.
     """
     result = np.zeros(segmentation.plane_ids.size, bool)
     valid = grid.inverse_depth > 0
@@ -199,7 +199,10 @@ def _transform_box(sensor_from_view: Pose, box: Box) -> Box:
 
 
 def _plane(plane: Row, lowest: float, sensor_from_view: Pose) -> Plane:
-    """Return a `PLANE` in the sensor frame; ``lowest`` is the lowest plane's offset, metres."""
+    """Return a `PLANE` as a record in the sensor frame, at its height above ``lowest``.
+
+    ``lowest`` is the offset of the lowest visible plane, metres.
+    """
     normal, offset = plane["up"], float(plane["offset"])
     outline = outline_corners(normal, offset, plane["extent"])
     if sensor_from_view is not IDENTITY:

@@ -37,7 +37,8 @@ class OutputConstants(NamedTuple):
     """Minimum number of cells, at the range limit, of an object that the limit cuts off: fewer are
     noise."""
     crowded: float = 0.08
-    """Fraction of points behind others above which a cloud counts as fused from several views."""
+    """A cloud counts as fused from several views if more than this fraction of its points is behind
+    others."""
 
 
 OUTPUT = OutputConstants()
