@@ -34,8 +34,8 @@ class CleanupSettings(NamedTuple):
     around_cells: int = 4
     """Distance from an object, in cells, at which the roughness of its plane is measured."""
     large_share: float = 0.02
-    """Minimum fraction of the image covered by a large object, an arm, furniture or the bent end of
-    a table."""
+    """A segment is large if it covers more than this fraction of the image, as large objects, arms,
+    furniture and the bent ends of tables do."""
     cut_share: float = 0.4
     """A large segment is an arm or furniture if more than this fraction of its perimeter is at the
     image border. The perimeter is that of a square with the same number of cells."""

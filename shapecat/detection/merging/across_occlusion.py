@@ -92,8 +92,8 @@ def _local_planes(samples: I4, grid: DepthGrid, normal: F4) -> F8:
 def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
     """Find the pairs of samples of two segments that lie in each other's local planes.
 
-    Returns the fraction of the samples that have a partner, in the segment where it is smaller, and
-    the positions (n, 2, 3) of some of the pairs, metres. ``a`` and ``b`` are from `_local_planes`.
+    Returns the smaller of the two segments' fractions of samples with a partner, and the positions
+    (n, 2, 3), metres, of some of the pairs. ``a`` and ``b`` are from `_local_planes`.
     """
     with_a, with_b = np.zeros(a.shape[1], np.bool_), np.zeros(b.shape[1], np.bool_)
     pairs = np.zeros((SAMPLES * SAMPLES, 2), np.uint8)

@@ -140,8 +140,8 @@ class AssumedSettings(NamedTuple):
     """Constants for a plane assumed below samples that no visible plane supports."""
 
     max_depth_m: float = 2.0
-    """Depth up to which such samples may be objects that hide their support, metres; farther away
-    they are background."""
+    """Depth up to which unexplained samples may be objects that hide their support, metres; farther
+    away they are background."""
     unexplained: float = 0.2
     """A plane is assumed if more than this fraction of the samples is unexplained. If a table is in
     plain view, the fraction is at most 0.06."""

@@ -110,7 +110,7 @@ def _is_top(
 
 
 def _overlaps(lower: SupportingPlane, upper: SupportingPlane) -> bool:
-    """Return whether the middle (Steiner point) of ``upper`` is above the outline of ``lower``."""
+    """Return whether the middle (Steiner point) of ``upper`` is over the area of ``lower``."""
     x, y = upper.extent @ COS * 2 / DIRECTIONS, upper.extent @ SIN * 2 / DIRECTIONS
     return bool(np.all(COS * x + SIN * y < lower.extent))
 

@@ -19,7 +19,7 @@ from shapecat.jit import kernel, unset
 __all__ = ["SurfaceGraph", "connect_surfaces"]
 
 BENT = 4
-"""Factor from the bit of a link to a temporary bit: only a local plane supports this link."""
+"""A link's bit times this is a temporary bit: it marks links that only a local plane supports."""
 MIN_CHORD = 3e-4
 """Squared distance between two unit normals at an angle of one degree."""
 

@@ -43,7 +43,7 @@ def watershed(
 
 @kernel
 def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n: int) -> int:
-    """Label connected parts of unlabelled cells with angles below ``edge_deg``, from ``n`` + 1.
+    """Label connected parts of unlabelled cells with concavity below ``edge_deg``, from ``n`` + 1.
 
     Small parts stay unlabelled. Returns the last label. ``plane_id`` is as in `HeightMap`;
     ``labels`` (rows, columns), 0 where unlabelled, is changed in place.
