@@ -32,7 +32,7 @@ Bool: TypeAlias = NDArray[np.bool_]
 Records: TypeAlias = NDArray[np.void]
 """An array of a structured type, whose elements kernels read and write by the names of fields."""
 Row: TypeAlias = Any
-"""One element of such an array."""
+"""One element of a `Records` array."""
 # mypy only tells floats, integers and Booleans apart; records enforce the exact type with `freeze`.
 
 
@@ -110,7 +110,7 @@ def array(shape: str, dtype: str, **options: Any) -> Any:
 
 
 class _ShortRepr(reprlib.Repr):
-    """Text that fits a console: type and shape of arrays, the first elements of collections."""
+    """A ``repr`` that fits a console: type and shape of arrays, first elements of collections."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -164,7 +164,7 @@ class Record:
         return f"{type(self).__name__}({', '.join(values)})"
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a record in another process, where its arrays would be writable."""
+        """Restore a pickled record, and make its arrays read-only again."""
         self.__dict__.update(state)
         for name, *_ in self._arrays:
             if (value := state.get(name)) is not None:

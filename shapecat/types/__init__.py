@@ -1,7 +1,7 @@
 """The records that stages pass on: frozen, shape-checked, read-only.
 
 Units are metres, seconds, radians; stamps are integer nanoseconds; quaternions are x, y, z, w.
-Transforms are named ``a_from_b``. "Sensor frame" is the frame named by ``frame_id``; a depth
+Transforms are named ``a_from_b``. The sensor frame is the coordinate frame of the sensor; a depth
 camera's is the optical frame (x right, y down, z forward).
 """
 

@@ -39,12 +39,12 @@ class Frame(Record):
 
     Attributes
     ----------
-    topic : the stream of the recording.
-    index : number of the frame in its stream, counted from 0 at the selected start; frames that
+    topic : name of the topic.
+    index : number of the frame on its topic, counted from 0 at the selected start; frames that
         are skipped count, too.
     stamp_ns : time of the measurement (``header.stamp``).
-    log_time_ns : time of the recording.
-    frame_id : name of the sensor frame, or of the frame that ``frame_from_sensor`` relates it to.
+    log_time_ns : time at which the message was recorded.
+    frame_id : name of a coordinate frame: the sensor frame, unless ``frame_from_sensor`` is given.
     depth : (h, w) metres along the optical axis; 0 where depth is missing, never NaN.
     points : (n, 3) metres, sensor frame; rows of NaN where depth is missing.
     frame_from_sensor : pose of the sensor in the frame ``frame_id``; None if ``frame_id`` is the
@@ -62,7 +62,7 @@ class Frame(Record):
     frame_from_sensor: Pose | None = None
 
     def __post_init__(self) -> None:
-        """Check that the frame has either depth or points, and a camera of the same size."""
+        """Check that the frame has either points, or depth and a camera of the same size."""
         super().__post_init__()
         if (self.depth is None) == (self.points is None):
             msg = "a Frame has either depth or points"

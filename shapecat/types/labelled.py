@@ -16,7 +16,7 @@ class LabelledObject(Record):
     Attributes
     ----------
     track : number of the track.
-    category, confidence : final, from all views of the track.
+    category, confidence : final: fused from all views of the track, or corrected by a person.
     box, gas : box and surface of the visible part, sensor frame.
     indices : (n,) ascending flat indices of its pixels or points in the frame.
     posterior : (c,) from this view alone.
@@ -51,9 +51,10 @@ class LabelledFrame(Record):
 
     Attributes
     ----------
-    fixed_from_sensor : None where the recording has no fixed frame.
+    topic, index, stamp_ns, log_time_ns, frame_id : as in `Frame`.
+    fixed_from_sensor : pose of the sensor in the fixed frame; None if unknown.
     ended : tracks that ended in the previous frame of the topic.
-    seconds : time spent in each stage.
+    seconds : time spent in each stage, by its name.
     up : (3,) unit vector, sensor frame.
     reused_from : index of the earlier frame from which the scene is copied; None if it is new.
     masks : None without a colour image.
@@ -77,7 +78,8 @@ class LabelledFrame(Record):
 class AnnotationBox(NamedTuple):
     """The annotation of one object, as plain numbers.
 
-    ``center`` (metres), ``size`` (metres) and ``orientation`` (x, y, z, w) are as in `Box`.
+    ``center``, ``size`` (metres) and ``orientation`` (x, y, z, w) are those of a `Box`, but in the
+    coordinate frame ``frame_id``.
     """
 
     track: int

@@ -19,7 +19,7 @@ __all__ = [
 ]
 
 CATEGORIES = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
-"""The shape categories of the default model, in the order of every posterior."""
+"""The shape categories of the default model, in the order of its posteriors."""
 UNKNOWN = "unknown"
 """The category of an object that fits none of the model's categories. Also the label of such an
 object, and its folder in a data set."""
@@ -66,7 +66,7 @@ class FullBox(Box):
     ----------
     size_std : (3,) metres, the standard deviation of each length.
     outline : (96,) metres, the support function of the visible points about the centre, in
-        horizontal directions every 3.75 degrees, from the first axis of the box to the second.
+        horizontal directions every 3.75 degrees: a full turn from the box's x axis toward its y.
     """
 
     size_std: F4 = array("3", "f4")
@@ -81,7 +81,7 @@ class Candidate(Record):
     indices : (n,) ascending indices into the frame, at full resolution.
     plane : index in `Scene.planes` of the plane below it; None if there is none.
     on_candidate : index in `Scene.candidates` of the candidate it stands on; None if there is none.
-    support_m : height of the surface it stands on above `plane`, metres; 0 on the plane itself.
+    support_m : height above `plane` of the surface it stands on, metres; 0 on the plane itself.
     touches_border : whether the border of the image, or the maximum range, cuts it off.
     occluded : whether a nearer surface hides part of it.
     """
@@ -98,7 +98,7 @@ class Candidate(Record):
 class Scene(Record):
     """The result of detection in one frame.
 
-    ``up`` is a (3,) unit vector in the sensor frame; ``planes`` are in order of height.
+    ``up`` is a (3,) unit vector in the sensor frame; ``planes`` are in ascending height.
     """
 
     up: F4 = array("3", "f4")
@@ -169,7 +169,8 @@ class ImageMasks(Record):
     width, height : size of the image, pixels.
     boxes : left, top, width and height of each mask, pixels, by the number of the detection (from
         0); detections that the image does not show are missing.
-    counts : (n,) uint32 run lengths of each mask, from `shapecat.colour.rle.rle_counts`.
+    counts : by the same numbers, the (n,) uint32 run lengths of each mask, from
+        `shapecat.colour.rle.rle_counts`.
     """
 
     topic: str
