@@ -15,7 +15,7 @@ __all__ = ["BoostedTrees", "logit_of", "read_trees", "write_trees"]
 
 
 class BoostedTrees(NamedTuple):
-    """Trees whose leaf values add up to a logit; ``value`` (n,) has an element for each node."""
+    """Trees whose leaf values add up to a logit; ``value`` (n,) holds the value of each node."""
 
     trees: Trees
     value: F4
@@ -26,11 +26,12 @@ def read_trees(content: bytes, features: np.dtype[Any]) -> BoostedTrees:
 
     Parameters
     ----------
-    features : the record type of the features, by which the trees index them.
+    features : structured type of the features; the trees refer to its fields, nested ones
+        included, by index.
 
     Raises
     ------
-    ValueError : the trees were trained with other features, or in another order.
+    ValueError : the trees were trained with other features, or with these in another order.
     """
     with np.load(BytesIO(content), allow_pickle=False) as arrays:
         if arrays["names"].tolist() != list(_names(features)):
@@ -55,7 +56,8 @@ def _names(features: np.dtype[Any]) -> Iterator[str]:
 def logit_of(ensemble: BoostedTrees, features: F4, lower: float, upper: float) -> float:
     """Return the logit of features (f,): the sum of the values of the leaves they reach.
 
-    The sum stops early, `LANES` trees at a time, once it is below ``lower`` or above ``upper``.
+    It is checked after every `LANES` trees, and returned early if below ``lower`` or above
+    ``upper``.
     """
     (roots, feature, threshold, left), value = ensemble
     leaves, logit = np.zeros(LANES, np.int32), 0.0
