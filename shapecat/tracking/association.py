@@ -10,7 +10,7 @@ from shapecat.arrays import F4, F8, I4
 __all__ = ["assign", "posterior_difference", "size_difference", "size_key", "sorted_sides"]
 
 _SIZE_SLACK_M = 0.01
-"""Added to every length before taking its logarithm, as a flat side may vary by a centimetre."""
+"""Added to every length before its logarithm is taken: a thin side may vary by a centimetre."""
 
 
 def sorted_sides(sizes: F4) -> F8:
@@ -23,7 +23,7 @@ def sorted_sides(sizes: F4) -> F8:
 
 
 def size_key(sizes: F4) -> F8:
-    """Return the logarithms (n, 3) of the `sorted_sides`, plus 1 cm, of sizes (n, 3), metres."""
+    """Return the logarithms (n, 3) of `sorted_sides` plus 1 cm, for sizes (n, 3) in metres."""
     return np.asarray(np.log(np.maximum(sorted_sides(sizes), 0.0) + _SIZE_SLACK_M))
 
 
@@ -65,7 +65,7 @@ def assign(costs: F8, limit: float, method: Literal["hungarian", "greedy"]) -> I
 
 
 def _greedy(gain: F8) -> I4:
-    """Return pairs (p, 2) of rows and columns of ``gain`` (m, n), the smallest value first."""
+    """Pair rows with columns of ``gain`` (m, n), smallest value first; return (p, 2), by row."""
     rows, columns = np.nonzero(gain)
     free_row, free_column = np.ones(gain.shape[0], bool), np.ones(gain.shape[1], bool)
     pairs = []

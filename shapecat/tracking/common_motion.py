@@ -72,8 +72,9 @@ def find_common_motion(table: DetectionTable, tracks: Sequence[I4]) -> CommonMot
 
     Returns
     -------
-    The motion; None if fewer than three tracks have at least five detections, if less than 70 % of
-    their detections belong to moving objects, or if less than 70 % fit a common motion.
+    The motion; None if the orientations are unknown, if fewer than three tracks have at least five
+    detections, if less than 70 % of their detections belong to moving objects, or if less than 70 %
+    fit a common motion.
 
     Notes
     -----
@@ -154,9 +155,9 @@ def _fit(
 ) -> tuple[C16, C16]:
     """Fit the rotation and the translation of each frame that map ``observed`` to ``reference``.
 
-    Both are (n,), ``rows`` (n,) is the frame of each point, ``weights`` (n,) its weight. A frame
-    with fewer than two points keeps its ``turn`` and ``shift``. Points and translations in the
-    plane are complex numbers; a rotation is a complex number of modulus 1.
+    ``observed`` and ``reference`` (n,) are points, ``rows`` and ``weights`` (n,) their frames and
+    weights. A frame with fewer than two points keeps its ``turn`` and ``shift`` (f,). Points and
+    translations in the plane are complex numbers; a rotation is a complex number of modulus 1.
     """
     count = len(turn)
     mean_observed = _means(observed, rows, weights, count)
@@ -170,16 +171,16 @@ def _fit(
 
 
 def _sums(values: C16, groups: I4, count: int) -> C16:
-    """Return the sums (count,) of ``values`` (n,) in each of the ``groups`` (n,), from 0."""
+    """Return the sum of the values in each group, (count,).
+
+    ``groups`` (n,) is the group of each of the ``values`` (n,), from 0.
+    """
     real = np.bincount(groups, values.real, count)
     return np.asarray(real + 1j * np.bincount(groups, values.imag, count))
 
 
 def _means(values: C16, groups: I4, weights: F8, count: int) -> C16:
-    """Return the means (count,) of ``values`` (n,) in each of the ``groups`` (n,), from 0.
-
-    ``weights`` (n,) are those of the values.
-    """
+    """Return the weighted mean of the values in each group, as in `_sums`; 0 for an empty group."""
     total = np.bincount(groups, weights, count)
     return _sums(values * weights, groups, count) / np.maximum(total, 1e-300)
 

@@ -34,8 +34,8 @@ class DetectionTable:
     """All detections of a stream, in the order of the frames.
 
     A detection takes only about 100 bytes, because the detections of many hours are in memory at
-    once. A track is given by the indices of its detections, ascending; ``rows`` are indices of
-    frames, whose numbers are in ``frames``.
+    once. A track is given by the indices of its detections, ascending. A *row* is the index of a
+    frame in this table, as opposed to its number on its topic, in ``frames``.
 
     Attributes
     ----------
@@ -43,15 +43,15 @@ class DetectionTable:
     topics, frames, stamps_ns : (f,) index into ``names``, number and time of each frame.
     first : (f + 1,) index of the first detection of each frame.
     rows : (n,) index of the frame of each detection, ascending.
-    numbers : (n,) numbers of the detections, by which tracks name them.
-    centers : (n, 3) centres of the boxes, metres, in the fixed frame; in the sensor frame if the
-        recording has no fixed frame. All frames of a stream use the same coordinate frame.
+    numbers : (n,) number of each detection, by which `Track.detections` refers to it.
+    centers : (n, 3) centres of the boxes, metres, in the fixed frame; in the sensor frame if its
+        pose is unknown. All frames of a stream use the same coordinate frame.
     sizes : (n, 3) lengths of the boxes, metres; the third one is along the up direction.
     posteriors : (n, c) posteriors of the single views; each sums to 1.
     partial : (n,) whether the image border or an occluder cuts the object.
     novelties : (n,) novelties of the single views.
     orientations : (n, 4) unit quaternions (x, y, z, w) of the boxes, in the frame of the centres;
-        None if they are not needed.
+        None if they are unknown or no longer needed.
     described : (n,) number of the frame from which the description of each detection was copied;
         that of its own frame if it was not copied.
     """
@@ -72,7 +72,7 @@ class DetectionTable:
     described: I4
 
     def without_boxes(self) -> Self:
-        """Return the detections without sizes and orientations, which tracks do not need."""
+        """Return the detections without sizes and orientations, which a `Track` does not need."""
         return replace(self, sizes=np.zeros((0, 3), np.float32), orientations=None)
 
     def axes(self, which: I4 | slice) -> F8:
@@ -121,7 +121,7 @@ class DetectionTable:
         return np.where(new, view_weights(self.partial[track]), 0.0)
 
     def of_frames(self, rows: I4) -> tuple[I4, I4]:
-        """Return the detections (k,) of frames ``rows``, and the index in ``rows`` (k,) of each."""
+        """Return the detections (k,) of ``rows``, and for each the index of its row in ``rows``."""
         first, stop = self.first[rows], self.first[rows + 1]
         which = np.repeat(np.arange(len(rows)), stop - first)
         return np.arange(which.size) - (np.cumsum(stop - first) - stop)[which], which
@@ -133,7 +133,7 @@ class DetectionTable:
         """
         if len(rows) == 0:
             return np.zeros((0, 3))
-        # Use only detections near these frames, as long tracks are queried for many short spans.
+        # Use only detections near these frames: long tracks are queried for many short spans.
         before, after = np.searchsorted(track, self.first[[rows.min() + 1, rows.max()]])
         nearest = track[max(before - 1, 0) : after + 1]
         last = np.maximum(np.searchsorted(self.rows[nearest], rows, side="right") - 1, 0)
@@ -170,7 +170,8 @@ class DetectionTable:
 class TableBuilder:
     """Builds the `DetectionTable` of a stream from its frames, as they are read.
 
-    Columns are growing byte buffers, since joining arrays would need twice the memory.
+    ``categories`` is the number of categories in the posteriors. Columns are growing byte buffers,
+    since joining arrays would need twice the memory.
     """
 
     def __init__(self, categories: int) -> None:
@@ -195,7 +196,7 @@ class TableBuilder:
             self._bytes[name] += np.asarray(columns[name], kind).tobytes()
 
     def table(self) -> DetectionTable:
-        """Return the table of the stream, sorted by time; the builder cannot be used afterwards."""
+        """Return the table, the topics merged by time; the builder cannot be used afterwards."""
         of_frames = {name: self._column(name, kind) for name, kind in _OF_FRAMES.items()}
         counts = of_frames.pop("counts")
         which: Any = slice(None)
@@ -214,7 +215,7 @@ class TableBuilder:
         )
 
     def _column(self, name: str, kind: str, shape: tuple[Any, ...] = ()) -> Any:
-        """Return a column (n, *shape) that takes over its bytes; "c" stands for all categories."""
+        """Move a column to an array (n, *shape) of type ``kind``; "c" is the category axis."""
         widths = (self._categories if width == "c" else width for width in shape)
         return np.frombuffer(self._bytes.pop(name), kind).reshape(-1, *widths)
 
@@ -239,7 +240,7 @@ def _times_set_back(stamps_ns: I4) -> I4:
     Single wrong stamps do not count: the two frames before must both be later than this one and
     the next.
     """
-    # No second stamp confirms a jump after the first or before the last: neither counts.
+    # A jump after the first stamp or before the last one cannot be confirmed, and does not count.
     ends = ((stamps_ns.min(), stamps_ns.max()),)
     stamps = np.pad(stamps_ns, 2, constant_values=ends)
     before = np.minimum(stamps[:-4], stamps[1:-3])

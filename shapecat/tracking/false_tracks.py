@@ -18,7 +18,8 @@ def without_pieces(table: DetectionTable, tracks: Sequence[I4], max_gap_s: float
     If an object is split in some frames, the centre of a piece's track lies, in the other frames,
     in the box of the whole object. An object that only stands near another one, or is occluded by
     it, has its centre outside that box. ``tracks`` are the indices (k,) of the detections of each
-    track, ascending; gaps in a track that are longer than ``max_gap_s`` are not checked.
+    track, ascending; gaps in a track that are longer than ``max_gap_s`` are not checked. Without
+    orientations, no track is removed.
     """
     if table.orientations is None:
         return list(tracks)
@@ -31,7 +32,7 @@ def without_pieces(table: DetectionTable, tracks: Sequence[I4], max_gap_s: float
 
 
 def _covered(table: DetectionTable, track: I4, max_gap_s: float) -> int:
-    """Count the frames of a track without detection in which another box contains its centre.
+    """Count the frames in which a track has no detection, but another box contains its centre.
 
     Gaps of more than ``max_gap_s`` are left out.
     """

@@ -46,7 +46,7 @@ def fuse(posteriors: ArrayLike, method: Method = "product", weights: ArrayLike |
 
     Returns
     -------
-    (c,) which sums to 1.
+    The fused posterior (c,), which sums to 1.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def fuse_novelty(novelties: ArrayLike, weights: ArrayLike) -> float:
 
 
 def _evidence(views: F8, method: str) -> F8:
-    """Return what is summed over views (k, c) of posteriors: probabilities, logarithms or votes."""
+    """Return the terms (k, c) that are summed over the views: posteriors, logarithms or votes."""
     if method == "mean":
         return views
     if method == "product":

@@ -31,7 +31,8 @@ def join_pieces(table: DetectionTable, tracks: Sequence[I4]) -> list[I4]:
 
     Returns
     -------
-    The detections (k,) of each object, ascending, in the order of their first track.
+    The detections (k,) of each object, ascending, in the order of their first track; ``tracks`` if
+    the orientations are unknown.
     """
     if table.orientations is None or len(tracks) < 2:
         return list(tracks)
@@ -97,9 +98,9 @@ def _neighbours(table: DetectionTable, owner: I4, block: slice) -> I4:
 def _fit(table: DetectionTable, pairs: I4, wholes: F8) -> Bool:
     """Return the mask (p,) of pairs of detections (p, 2) that are pieces of one object.
 
-    ``wholes`` (p, 2, 3) are the lengths of the whole object, estimated from either track. The joint
-    box of two pieces is no larger than the whole object, and neither piece fills it, as a bowl
-    with an object in it would.
+    ``wholes`` (p, 2, 3) are the lengths of the whole object, estimated from each of the two tracks.
+    The joint box of two pieces is no larger than the whole object, and neither piece fills it, as a
+    bowl with an object in it would.
     """
     joint = np.minimum(_joint(table, pairs), _joint(table, pairs[:, ::-1]))
     lengths = sorted_sides(table.sizes[pairs.ravel()]).reshape(-1, 2, 3)
@@ -121,7 +122,7 @@ def _joint(table: DetectionTable, pairs: I4) -> F8:
 
 
 def _largest(table: DetectionTable, track: I4) -> I4:
-    """Return the largest detection of each frame (f,), of the detections ``track`` (n,)."""
+    """Return the largest of the detections ``track`` (n,) in each of their frames, (f,)."""
     volume = table.sizes[track].astype(np.float64).prod(axis=1)
     order = track[np.lexsort([-volume, table.rows[track]])]
     first = np.concatenate([[True], np.diff(table.rows[order]) > 0])

@@ -40,8 +40,9 @@ def track_recording(
     -------
     Confirmed tracks, made on demand, numbered from 1 in order of birth (time, then stream, then
     position). A track is confirmed by ``settings.min_hits`` detections, or by fewer if fewer frames
-    of the same scene lie within half a second of its first. So a recording of single images, one
-    per second, keeps every detection. Detections without a confirmed track count as false.
+    of the same topic and scene lie within half a second of its first. So a recording of single
+    images, one per second, keeps every detection. Detections without a confirmed track count as
+    false.
 
     Notes
     -----
@@ -97,7 +98,7 @@ def _follow(table: DetectionTable, settings: TrackingSettings) -> list[I4]:
 def _associate(table: DetectionTable, cuts: Bool, settings: TrackingSettings) -> I4:
     """Return the tracker's track number of each detection, (n,).
 
-    ``cuts`` (f,) are the frames that begin a new scene.
+    ``cuts`` (f,) marks the frames that begin a new scene.
     """
     tracker, ids = Tracker(settings), np.zeros(len(table.rows), np.int32)
     frames = zip(table.stamps_ns.tolist(), cuts.tolist(), strict=True)
@@ -117,7 +118,7 @@ def _associate(table: DetectionTable, cuts: Bool, settings: TrackingSettings) ->
 
 
 def _groups(labels: I4) -> list[I4]:
-    """Return the ascending indices of each label, for the labels in ascending order."""
+    """Return, for each label in ascending order, the ascending indices of its items, (k,)."""
     order = np.argsort(labels, kind="stable").astype(np.int32)
     return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
 
@@ -188,9 +189,9 @@ def _line(table: DetectionTable, detections: I4, at: int) -> tuple[F8, F8]:
 def _needed(table: DetectionTable, scenes: I4, row: int, min_hits: int) -> int:
     """Return the number of detections that confirm a track born in frame ``row``.
 
-    That is ``min_hits``, or the number of frames of its topic in the burst around it, if smaller:
-    the frames within `_BURST_NS` in the same scene. ``scenes`` (f,) numbers the scenes, the parts
-    of the recording between cuts. Sensors of other topics may not see the object.
+    That is ``min_hits``, or the number of frames of the same topic and scene within `_BURST_NS` of
+    this frame, if smaller. ``scenes`` (f,) numbers the scenes, the parts of the recording between
+    cuts. Sensors of other topics may not see the object.
     """
     frames_near, stamps, topics = 1, table.stamps_ns, table.topics
     for direction in (1, -1):
@@ -204,7 +205,7 @@ def _needed(table: DetectionTable, scenes: I4, row: int, min_hits: int) -> int:
 
 
 def _build_track(number: int, stream: _Followed, track: I4, settings: TrackingSettings) -> Track:
-    """Return the track ``number`` of the detections with the indices ``track`` (n,)."""
+    """Return a `Track` with id ``number`` and the detections with the indices ``track`` (n,)."""
     table = stream.table
     rows, source = table.frame_span(track, settings.max_missed_s)
     views, weights = table.posteriors[track], table.weights(track)

@@ -8,7 +8,7 @@ __all__ = ["Track"]
 
 
 class Track(Record):
-    """One object over the frames of its streams, from its first to its last detection.
+    """One object over the frames of its topics, from its first to its last detection.
 
     A track has a row for each frame. In a row without a detection the track *coasts*: its centre is
     interpolated linearly in time between detections. A gap longer than
@@ -17,9 +17,9 @@ class Track(Record):
     Attributes
     ----------
     id : number of the track in the recording, from 1, in order of birth.
-    topics : (k,) stream of each frame: one, or several that were tracked together.
+    topics : (k,) topic of each frame: one, or several that were tracked together.
     hits : number of rows with a detection.
-    frames : (k,) numbers of the frames in their streams, in temporal order.
+    frames : (k,) numbers of the frames on their topics, in temporal order.
     stamps_ns : (k,) times of the frames.
     detections : (k,) number of the detection in `DetectionTable`, -1 where the track coasts.
     centers : (k, 3) metres, in the coordinate frame of `DetectionTable.centers`.
@@ -48,5 +48,5 @@ class Track(Record):
 
     @property
     def topic(self) -> str:
-        """Name of its stream; several names are joined by a space."""
+        """The name of its topic; several names are sorted and joined by a space."""
         return " ".join(sorted(set(self.topics)))

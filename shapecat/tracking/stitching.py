@@ -28,7 +28,7 @@ _LOOKAHEAD = 8  # later fragments at the same position that are considered
 
 
 class Fragments(Record):
-    """Tracks found without knowing the future, one per row, in order of birth.
+    """Parts of tracks between long gaps, found without knowing the future, one per row.
 
     Attributes
     ----------
@@ -61,8 +61,8 @@ def merge_fragments(fragments: Fragments, settings: TrackingSettings) -> I4:
     """Stitch fragments that agree in position, size and posterior and do not overlap in time.
 
     The end of a fragment is linked to the start of a later one, the best pair first. Each end and
-    each start is used once, so that a chain never has two detections at a time. An object that was
-    replaced by a similar one while out of view counts as the same.
+    each start is used at most once, so that a chain never has two detections at a time. An object
+    that was replaced by a similar one while out of view counts as the same.
 
     Returns
     -------
@@ -122,9 +122,9 @@ def _contradiction(keys: F8, other_keys: F8, size_known: Bool, other_size_known:
 
 
 def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> Iterator[I4]:
-    """Yield, for each fragment, later ones that start near its position or soon after its end.
+    """Yield, for each fragment, later ones that start near its end position or soon after its end.
 
-    ``limit`` (n,) is the largest distance for each fragment, metres. Yields indices (k,).
+    These are indices (k,). ``limit`` (f,) is the largest distance for each fragment, metres.
     """
     if len(limit) == 0:
         return
@@ -146,8 +146,8 @@ def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> 
 def _distances(fragments: Fragments, i: int, after: I4, settings: TrackingSettings) -> F8:
     """Return the distances (k,), metres, between the end of fragment i and the starts of ``after``.
 
-    ``after`` (k,) are indices of fragments. Over a short gap, both are also extrapolated with their
-    velocities to the middle of the gap; the smaller distance counts.
+    ``after`` (k,) are indices of fragments. Over a short gap, both positions are also extrapolated
+    with their velocities to the middle of the gap; the smaller distance counts.
     """
     resting = np.linalg.norm(fragments.start[after] - fragments.end[i], axis=1)
     gap_s = (fragments.first_ns[after] - fragments.last_ns[i])[:, None] * 1e-9
@@ -162,12 +162,12 @@ def scene_cuts(table: DetectionTable, settings: TrackingSettings) -> Bool:
     """Return the mask (f,) of frames of a stream that begin a new scene.
 
     Recordings of single images can show different objects at the same position from one frame to
-    the next. Only objects less than 0.3 m from some object of the other frame are compared. Two
-    frames disagree if fewer than half of these match an object there in position and size and, over
-    0.3 s apart, in posterior (see `_continues`). A single odd frame is not a cut: the frames on
-    both sides of it must disagree too. Only frames of one topic are compared, as other sensors may
-    see other objects. Frames without detections are ignored. A clock that jumps back by more than
-    ``max_missed_s`` also begins a new scene.
+    the next. Objects less than 0.3 m from an object of the other frame are compared. Two frames
+    disagree if fewer than half of the compared objects match one of the other frame in position,
+    size and, if the frames are more than 0.3 s apart, posterior (see `_continues`). A single odd
+    frame is not a cut: the frames on both sides of it must disagree too. Only frames of one topic
+    are compared, as other sensors may see other objects. Frames without detections are ignored. A
+    clock that jumps back by more than ``max_missed_s`` also begins a new scene.
     """
     stamps, filled = table.stamps_ns, np.unique(table.rows)
     result = np.diff(stamps, prepend=stamps[:1]) < -settings.max_missed_s * 1e9
@@ -191,11 +191,11 @@ def scene_cuts(table: DetectionTable, settings: TrackingSettings) -> Bool:
 def _with_neighbours(
     table: DetectionTable, filled: I4, topic: int
 ) -> Iterator[tuple[int, int, int, int, int]]:
-    """Yield each frame of a topic with detections, except the first, and four frames near it.
+    """Yield each of a topic's frames with detections, except the first, and four of its frames.
 
-    Before it, these are the last frame with detections, the last frame, and the second last frame
-    with detections; after it, the next frame with detections. -1 stands for a missing frame.
-    ``filled`` (k,) are all frames with detections.
+    These are the previous frame with detections, the previous frame, the second previous one with
+    detections, and the next one with detections; -1 stands for a missing frame. ``filled`` (k,) are
+    the rows of all frames with detections.
     """
     frames, nonempty = np.flatnonzero(table.topics == topic), filled[table.topics[filled] == topic]
     before = frames[np.searchsorted(frames, nonempty) - 1]
@@ -211,8 +211,8 @@ def _continues(
     """Return whether frames i and j may show the same scene: at least half of the objects match.
 
     A partial view may be smaller than its object. If the frames are ``slow``, that is, more than
-    0.3 s apart, positions and posteriors must agree more closely, but less so in partial views. It
-    is then also enough that most objects, and at least two, have moved together, on a belt or as
+    0.3 s apart, positions and posteriors must agree more closely, but less so in partial views.
+    Then it is also enough that most objects, and at least two, have moved together, on a belt or as
     seen by a moving sensor: unrelated images rarely look like that.
     """
     a, b = table.of_frame(i), table.of_frame(j)

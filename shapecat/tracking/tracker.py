@@ -34,19 +34,19 @@ def gate_radius(size_keys: F8, gate_m: float) -> F8:
 
 @dataclass
 class _Active:
-    """The tracks that have not ended, one per row, in order of birth."""
+    """The tracks that have not ended, or new ones at detections, one per row, in order of birth."""
 
     ids: I4
     position: F8
     velocity: F8
     variance: F8  # var(position), cov(position, velocity), var(velocity); equal for x, y and z
-    size: F8
+    size: F8  # running mean of `size_key`
     posterior: F8
     hits: I4
     born_ns: I4
     seen_ns: I4
-    missed: I4
-    topics: I4  # the sensor that saw it last
+    missed: I4  # number of frames of this sensor since the last detection
+    topics: I4  # number of the sensor that saw it last
 
     def rows(self, which: Bool) -> Self:
         """Return the tracks selected by a mask."""
@@ -160,7 +160,10 @@ class Tracker:
         return detections.ids
 
     def _tick(self, stamp_ns: int) -> float:
-        """Advance the clock, never backwards; return the elapsed seconds."""
+        """Advance the clock, never backwards; return the elapsed seconds.
+
+        If the stamp is more than ``max_missed_s`` before the last one, end all tracks.
+        """
         elapsed = 0 if self._stamp_ns is None else stamp_ns - self._stamp_ns
         self._stamp_ns = stamp_ns
         if elapsed < -self._settings.max_missed_s * 1e9:
@@ -169,7 +172,7 @@ class Tracker:
         return max(elapsed, 0) * 1e-9
 
     def _survivors(self, active: _Active) -> _Active:
-        """Remove tracks that were missed for longer than they had been seen before.
+        """Return the tracks except those missed for longer than they had been seen before.
 
         The limit is at least half a second and at most ``max_missed_s``. A track must also be
         missed in at least one frame, or in two if it is not confirmed, so that a long interval
@@ -183,10 +186,9 @@ class Tracker:
 
 
 def _seed(centers: F8, size_keys: F8, posteriors: F8) -> _Active:
-    """Return new tracks for detections, without numbers.
+    """Return new tracks at detections, with numbers and times of 0.
 
-    ``centers`` (n, 3) are in metres; ``size_keys`` (n, 3) are from `size_key`, ``posteriors`` (n,
-    c).
+    ``centers`` are (n, 3) metres, ``size_keys`` (n, 3) from `size_key`, ``posteriors`` (n, c).
     """
     n = len(centers)
     variance = np.tile([_NOISE_M**2, 0.0, _SPEED_M_S**2], (n, 1))
@@ -249,7 +251,8 @@ def _costs(tracks: _Active, detections: _Active, clock_ns: int, settings: Tracki
 def _correct(tracks: _Active, detections: _Active, pairs: I4, partial: Bool) -> None:
     """Update tracks in place with their detections.
 
-    ``pairs`` (p, 2) are rows of both; ``partial`` (n,) says which detections are partial views.
+    ``pairs`` (p, 2) are the row of a track and that of its detection; ``partial`` (n,) says which
+    detections are partial views.
     """
     i, j = pairs.T
     tracks.missed[i], tracks.topics[i] = 0, detections.topics[j]
