@@ -24,7 +24,7 @@ class FinishedRun:
     """A run folder, with the content of run.json and the final label of each track.
 
     ``common`` holds the categories of all runs that are exported together, so that categories have
-    the same order in each run; it is empty for a single run.
+    the same order in each run; it is empty except in exports.
     """
 
     folder: Path
@@ -101,7 +101,7 @@ def find_usable(folders: Iterable[Path]) -> tuple[list[FinishedRun], list[Shapec
 
     Returns
     -------
-    These runs, and the error of each other run.
+    The usable runs, and the error of each other run.
     """
     usable, errors = [], []
     for folder in folders:
@@ -124,7 +124,7 @@ def open_source(
     Parameters
     ----------
     moved_to : path of the recording; None for the path at which it was processed.
-    advice : advice in the error message if the recording was moved.
+    advice : what the error message suggests if the recording is missing or at a URL.
 
     Raises
     ------

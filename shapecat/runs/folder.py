@@ -67,7 +67,7 @@ None if the folder has no marker."""
 
 
 def made_by_run(folder: Path) -> Collection[str] | None:
-    """Return the names that a run makes in its folder; None if the folder holds no run."""
+    """Return the names of the items that a run makes in its folder; None if it holds no run."""
     with suppress(OutputError):
         if read_identity(folder)["id"]:
             return _MADE
@@ -154,9 +154,9 @@ def _strangers(folder: Path, names: Collection[str]) -> Iterator[Path]:
 
 
 def _replace(folder: Path, hidden: Path, marker: Marker) -> None:
-    """Rename the complete hidden folder; at any moment the old or the new folder is complete.
+    """Replace ``folder`` by the hidden one; at any moment, a complete folder exists.
 
-    If a command is writing outputs in the old folder, wait for it; it would go on in the new one.
+    First wait for a command that writes outputs in the old folder: it would go on in the new one.
     """
     flush(hidden)
     if folder.exists():
@@ -191,8 +191,8 @@ def _retire(folder: Path, marker: Marker) -> None:
 def recover(folder: Path, marker: Marker = made_by_run) -> None:
     """Complete or undo the replacement of a folder that a killed run began.
 
-    If there is no new folder, the earlier one is restored; else it is removed. ``marker``
-    recognises folders that shapecat made; see `Marker`.
+    The earlier folder is restored if there is no new one, else removed. ``marker`` recognises
+    folders that shapecat made; see `Marker`.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def recover(folder: Path, marker: Marker = made_by_run) -> None:
 
 
 def clear(folder: Path, names: Collection[str] = _MADE) -> None:
-    """Remove the given files and folders from a folder, in this order."""
+    """Remove the items ``names`` from a folder, in this order; by default all that a run makes."""
     for item in (folder / name for name in names):
         if item.is_dir() and not item.is_symlink():
             shutil.rmtree(item)

@@ -35,7 +35,7 @@ class _Selection(NamedTuple):
 
 
 def _boxes_of(table: pa.Table) -> F4:
-    """Return the values of `_BOXES` (n, 11): full boxes, and 1 if the object is partly hidden."""
+    """Return the values of `_BOXES` (n, 11): full boxes, and 1 for partial views."""
     return np.column_stack([full_boxes_of(table), partial_of(table)])
 
 
@@ -47,7 +47,7 @@ def _details_of(table: pa.Table) -> F4:
 
 _BOXES = _Selection([*FULL_BOX, "touches_border", "occluded"], BOX_WIDTH + 1, _boxes_of)
 """Centre, size (metres) and orientation (x y z w) of a detection's full box, NaN if unknown; and
-whether the object is occluded or cut off by the image border."""
+whether the view is partial: occluded, or cut off by the image border."""
 _DETAILS = _Selection(["size_full_std", "outline_full"], 3 + DIRECTIONS, _details_of)
 """The standard deviations and the outline of the full box of a detection."""
 
@@ -117,9 +117,9 @@ class FullBoxes:
         return result
 
     def _views(self, sighting: "_Sighting", picked: I4, details: F4) -> BoxViews:
-        """Return the views ``picked`` (k,) of a track in the fixed frame.
+        """Return the views with the indices ``picked`` (k,) of a track, in the fixed frame.
 
-        ``details`` are their columns `_DETAILS`: (k, 3) deviations of the size, then the outlines.
+        ``details`` are their values of `_DETAILS` (k, 3 + `DIRECTIONS`).
         """
         boxes, poses = sighting.boxes[picked], self.frames.poses_of(sighting.rows[picked])
         centers, axes = _placed(boxes, poses)
@@ -127,9 +127,9 @@ class FullBoxes:
         return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
 
     def _show(self, fused: FusedBox, sighting: "_Sighting", result: F4) -> None:
-        """Write the fused box of a track, in the sensor frame of each of its views.
+        """Write the fused box of a track to ``result``, in the sensor frame of each of its views.
 
-        ``result`` (frames, 13) are the rows of the track.
+        ``result`` (frames, 13) holds the rows of the track in `of_tracks`.
         """
         for first in range(0, len(sighting.rows), _BLOCK):
             block = slice(first, first + _BLOCK)
@@ -156,7 +156,7 @@ class _Sighting(NamedTuple):
 
     Attributes
     ----------
-    at, rows : (k,) indices in the track and in the detections.
+    at, rows : (k,) indices of the views in the track and in the table of detections.
     boxes : (k, 10) float32 centre and size (metres) and orientation (x y z w) in the sensor frame.
     partial : (k,) whether the object is occluded or cut off by the image border.
     """

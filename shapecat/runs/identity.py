@@ -127,7 +127,7 @@ class ContentDigest:
         _ = self._digest
 
     def result(self) -> str:
-        """Wait for the digest.
+        """Wait for the digest and return it; start reading if need be.
 
         Raises
         ------

@@ -213,7 +213,7 @@ def add_warnings(run: RunInfo, warnings: Iterable[str]) -> None:
 
 
 def identify(run: RunInfo, content: ContentDigest) -> None:
-    """Set the digest of the input and the id of the work.
+    """Set the digest of the input and the ``work`` id of a run, in place.
 
     Raises
     ------

@@ -91,7 +91,7 @@ class _MasksByFrame:
 
     @property
     def has_more(self) -> bool:
-        """Whether masks are left, because frames were not requested in the order of the table."""
+        """Whether masks are left: their frames were not requested, or not in the table's order."""
         return self._next is not None
 
 

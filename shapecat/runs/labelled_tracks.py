@@ -48,7 +48,7 @@ class LabelledTracks:
     ----------
     frames : the rows of each frame in the arrays below.
     detections : (rows,) number of each detection in its frame.
-    tracks : (rows,) number of its track.
+    tracks : (rows,) number of each detection's track, before tracks were merged.
     labels : the final label of each track.
     last_in : by frame, the tracks that end in it; frames in which none ends are missing.
     causal : (rows, categories) posterior of each track up to the frame; empty unless requested.
@@ -68,7 +68,12 @@ class LabelledTracks:
     def read(
         cls, folder: Path, labels: Mapping[int, TrackLabel], *, causal: bool = False
     ) -> "LabelledTracks":
-        """Read the tracks of a run; those missing from ``labels`` are left out."""
+        """Read the tracks of a run; those missing from ``labels`` are left out.
+
+        Raises
+        ------
+        OutputError : the table of tracks is unreadable.
+        """
         with opened(folder / "tracks.parquet", read_dictionary=["topic"]) as file:
             table = file.read(columns=["track", "topic", "frame", "stamp_ns", "detection"])
             topics, codes = topic_codes(table)
@@ -128,7 +133,7 @@ def read_annotation_frames(
 ) -> Iterator[AnnotationFrame]:
     """Yield the annotations of a run, frame by frame in reading order.
 
-    Annotations have no points, surfaces and posteriors, so that reading them is several times as
+    Annotations have no points, surfaces or posteriors, so that reading them is several times as
     fast as `shapecat.runs.labelled_frames.read_labelled_frames`. Their boxes are full boxes if
     these are known and ``visible`` is False, else visible boxes. The boxes are in the frame
     ``frame_id``.
@@ -163,7 +168,7 @@ def _boxes(
     *,
     visible: bool,
 ) -> Iterator[tuple[AnnotationBox, ...]]:
-    """Yield the boxes of each frame in ``keys``; ``ups`` (n, 3) are the up directions in these."""
+    """Yield the boxes of each frame, sensor frame; ``ups`` (n, 3) are the frames' up directions."""
     all_rows, places = frame_rows(detections), _places(detections)
     spans = [tracks.frames.get(key, _NO_ROWS) for key in keys]
     of_frames = [all_rows.get(key, _NO_ROWS) for key in keys]
@@ -201,11 +206,11 @@ def _join(places: F8, up: F4) -> F8:
 def _box(label: TrackLabel, row: Sequence[float]) -> AnnotationBox:
     """Return a box for annotations; ``row`` (10,) is centre, size and orientation."""
     center, size, orientation = tuple(row[:3]), tuple(row[3:6]), tuple(row[6:])
-    return AnnotationBox(*label, center, size, orientation)  # type: ignore[arg-type]  # as long as these
+    return AnnotationBox(*label, center, size, orientation)  # type: ignore[arg-type]  # lengths fit
 
 
 def _causal(file: pq.ParquetFile, rows: I4) -> F4:
-    """Return the causal posteriors (n, k) of some rows."""
+    """Return the causal posteriors (n, c) in ``rows`` (n,) of the table of tracks."""
     posteriors = _NONE
     for at, table in read_rows(file, ["posterior"], rows):
         values = np.reshape(numbers(table["posterior"]), (len(table), -1))
@@ -216,7 +221,7 @@ def _causal(file: pq.ParquetFile, rows: I4) -> F4:
 
 
 def _full(file: pq.ParquetFile, rows: I4) -> F4:
-    """Return the full boxes (n, 10) of some rows; NaN if unknown."""
+    """Return the full boxes (n, 10) in ``rows`` (n,) of the table of tracks; NaN if unknown."""
     boxes = np.zeros((len(rows), BOX_WIDTH), np.float32)
     for at, table in read_rows(file, FULL_BOX, rows):
         boxes[at] = full_boxes_of(table)
