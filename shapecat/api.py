@@ -203,9 +203,9 @@ def perceive(
     Parameters
     ----------
     reading : a depth image (h, w) along the optical axis, floats in metres or integers in
-        millimetres; or points (n, 3) or (h, w, 3) in the sensor frame, metres. Zero, negative and
-        non-finite depth, non-finite points, and values that NumPy masks are missing. Or a frame
-        of a recording, which needs no intrinsics.
+        millimetres; or points (n, 3) or (h, w, 3) in the sensor frame, metres; or a frame of a
+        recording, which needs no intrinsics. Depth that is zero, negative or not finite, points
+        that are not finite, and values that NumPy masks count as missing.
     intrinsics : fx, fy, cx, cy of the depth image, pixels, or its camera matrix (3, 3), or the
         `Camera` of a frame.
     up : (3,) up direction in the sensor frame; None to estimate it from planes.
@@ -260,7 +260,7 @@ def _path(given: str | Path) -> Path:
     if is_url(os.fspath(given)):
         msg = f"{given} is a URL; from Python, shapecat reads and writes local paths only"
         raise ConfigError(msg)
-    return Path(os.path.expanduser(given))  # noqa: PTH111  the other raises without a home
+    return Path(os.path.expanduser(given))  # noqa: PTH111  Path fails without a home
 
 
 def _one_recording(path: Path) -> Path:

@@ -48,7 +48,7 @@ class DetectionSettings:
         """Reject numbers that are out of range."""
         _check_range("detection.max_range_m", self.max_range_m, 0.01, 1000.0)
         _check_range("detection.fuse_frames", self.fuse_frames, 1, 30)
-        _check_range("detection.max_height_m", self.max_height_m, 0.025, 10.0)  # not millimetres
+        _check_range("detection.max_height_m", self.max_height_m, 0.025, 10.0)  # rejects mm
         _check_range("detection.max_size_m", self.max_size_m, 0.001, 10.0)
         _check_least("detection.min_points", self.min_points, 1)
 
@@ -195,7 +195,7 @@ def with_settings(settings: Settings, tree: Mapping[str, Any]) -> Settings:
 def with_overrides(settings: Settings, overrides: Sequence[str]) -> Settings:
     """Return settings with overrides such as ``detection.max_range_m=1.5`` applied together.
 
-    Of several values of a setting, the last one counts.
+    If a setting is overridden several times, the last value counts.
 
     Raises
     ------
@@ -221,7 +221,7 @@ def with_overrides(settings: Settings, overrides: Sequence[str]) -> Settings:
 
 
 def _merge(tree: dict[str, Any], more: Mapping[str, Any]) -> None:
-    """Add the values of ``more`` to a tree, in place."""
+    """Add the values of ``more`` to a nested tree, in place; they replace earlier ones."""
     for key, value in more.items():
         if isinstance(value, Mapping) and isinstance(tree.get(key), dict):
             _merge(tree[key], value)

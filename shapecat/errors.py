@@ -64,7 +64,7 @@ def explained(what: str, kind: type[ShapecatError]) -> Iterator[None]:
 
 
 def common_exit_code(codes: Collection[int]) -> int:
-    """Return the exit code that all recordings share, 0 for none, and 1 if they differ."""
+    """Return the exit code that all recordings share; 1 if they differ, 0 without recordings."""
     different = set(codes) or {0}
     return different.pop() if len(different) == 1 else 1
 

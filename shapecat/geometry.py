@@ -37,16 +37,16 @@ __all__ = [
 ]
 
 AGREE = 0.006
-"""Largest difference in inverse depth between two readings of one point, 1/m: two steps of a Kinect
-and twice its noise; 6 mm at 1 m, 24 mm at 2 m."""
+"""Largest difference in inverse depth between two measurements of one point, 1/m: two disparity
+steps of a Kinect, and twice its noise; 6 mm at 1 m, 24 mm at 2 m."""
 DISCONTINUITY = 0.012
-"""Step in inverse depth that separates two surfaces, 1/m: four steps of a Kinect, 1 cm at 0.9 m."""
+"""Step in inverse depth that separates two surfaces, 1/m: twice `AGREE`, 1 cm at 0.9 m."""
 NEAREST_M = 0.05
 """Smallest depth considered, metres: no sensor measures nearer, and inverse depth stays bounded."""
 IDENTITY = Pose(np.eye(3), np.zeros(3))
 """The pose that changes nothing."""
 LINK_FROM_OPTICAL = Pose(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
-"""Pose of an optical frame (x right, z forward) in that of a camera (x forward, z up; REP 103)."""
+"""Pose of an optical frame (x right, z forward) in a camera's link (x forward, z up; REP 103)."""
 BOX_EDGES = np.array(
     [(k, (k + 1) % 4) for k in range(4)]
     + [(k + 4, (k + 1) % 4 + 4) for k in range(4)]
@@ -301,9 +301,10 @@ _COS, _SIN = np.cos(_YAWS).astype(np.float32), np.sin(_YAWS).astype(np.float32)
 
 @kernel(fast=True, inner=True)
 def _smallest_rectangle(x: F4, y: F4) -> tuple[float, F8, F8]:
-    """Return the yaw of the smallest rectangle around points (n,), and its low and high corner.
+    """Return the yaw (radians) of the smallest rectangle around points, and its corners.
 
-    The corners (3,) have z = 0. The inner loop is over the yaws, so that it vectorises.
+    ``x`` and ``y`` (n,) are those of the points. The low and the high corner (3,) are in the axes
+    of the rectangle, with z = 0. The inner loop is over the yaws, so that it vectorises.
     """
     n = _YAWS.size
     left, back = np.full(n, np.float32(np.inf)), np.full(n, np.float32(np.inf))

@@ -41,7 +41,7 @@ def kernel(
     ----------
     fast : let the compiler reorder sums. Only for kernels that never meet NaN.
     inner : the function is called by kernels only, so that it needs no wrapper for Python, no file
-        in the cache, and no version for each literal. Called from Python, it is not compiled.
+        in the cache, and no version for each literal argument. Python calls it uncompiled.
         Callers that differ in ``fast`` or ``inner`` compile versions of their own.
     inline : compile the function as part of its caller, which must have the same ``fast``. Use it
         for kernels that are called in a single place: each saves 0.08 s of compilation.
@@ -70,7 +70,7 @@ def code_folder(stage: Path) -> Path | None:
     Its name holds a digest of all source files that the machine code can come from: numba checks
     only the file of the outermost kernel, not those of the kernels it calls. Folders of older
     sources are removed; a process that still uses one creates it again. A new folder begins as a
-    copy of one that is only readable, as in an image or on a shared disk.
+    copy of a read-only one, such as in a container image or on a shared disk.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def code_folder(stage: Path) -> Path | None:
 
 
 def _copy(source: Path, target: Path) -> None:
-    """Copy a folder at once, or not at all."""
+    """Copy a folder so that it appears complete, or not at all; ignore errors."""
     with suppress(OSError):
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="copy-", dir=target.parent) as hidden:
@@ -106,7 +106,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _stage_of(file: Path) -> Path:
-    """Return the folder of the package that contains a file; the file's own if it is elsewhere."""
+    """Return the subpackage of shapecat that contains a file, or else the file's own folder."""
     inside = (folder for folder in file.parents if folder.parent == _HERE)
     return next(inside, file.parent)
 
@@ -125,10 +125,10 @@ def _digest(stage: Path) -> str:
 
 
 def _places(stage: Path) -> Iterator[Path]:
-    """Yield the folders to try: numba's alone if set.
+    """Yield the folders to try, in order; only numba's cache folder if the user has set one.
 
-    Else beside the files, then the user's cache, then a temporary folder of the user, which is made
-    only if it is needed.
+    Otherwise ``__pycache__`` beside the files, the user's cache, and a temporary folder of the
+    user, which is made only if it is needed.
     """
     mine = f"{stage.name}-{hashlib.sha256(str(stage).encode()).hexdigest()[:16]}"
     if config.CACHE_DIR:
@@ -146,7 +146,10 @@ def _places(stage: Path) -> Iterator[Path]:
 
 
 def _temporary_folder() -> Path | None:
-    """Return a folder that nobody else can write to, since machine code is loaded from it."""
+    """Make a temporary folder that only this user can write to; return None if that is impossible.
+
+    Machine code is loaded from it.
+    """
     with suppress(OSError):
         folder = Path(tempfile.gettempdir(), f"shapecat-{os.getuid()}")
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -159,8 +162,8 @@ def _temporary_folder() -> Path | None:
 def _keep_freed_memory() -> None:
     """Keep freed memory in the process: mapping it again costs 0.5 ms per frame.
 
-    glibc maps blocks above a threshold separately, and returns free memory at the top of the heap;
-    freeing a large block raises both thresholds (mallopt(3), M_MMAP_THRESHOLD).
+    glibc has two thresholds: larger blocks are mapped separately, and more free memory at the top
+    of the heap is returned. Freeing a large block raises both (mallopt(3), M_MMAP_THRESHOLD).
     """
     np.empty(_LARGE_BYTES, np.uint8)  # noqa: TID251  nothing is read
 

@@ -94,7 +94,10 @@ def _read_perceiver(model: Path | None, model_id: str, settings: Settings) -> Pe
 
 
 class _Shape(NamedTuple):
-    """The surface of a candidate, sensor frame, its descriptor, and the seconds spent on both."""
+    """The surface of a candidate, sensor frame, its descriptor, and the seconds spent on both.
+
+    With too few points, the surface has no neurons, and the descriptor is 0.
+    """
 
     gas: NeuralGas
     descriptor: F4
@@ -125,8 +128,7 @@ class _BlockState(NamedTuple):
 
     Attributes
     ----------
-    reference : the last frame that did not repeat an earlier one, after fusion; None if there is
-        none.
+    reference : the last frame that repeated no earlier one, after fusion; None if there is none.
     perception : the result of that frame.
     keys : described objects, for comparison with later frames.
     """
@@ -167,7 +169,7 @@ def _perceive(
 def _perceive_objects(
     given: PerceptionInput, keys: tuple[KeyView, ...], perceiver: Perceiver, clock: "_Clock"
 ) -> tuple[Scene, tuple[Detection, ...], tuple[KeyView, ...]]:
-    """Detect the objects of a frame, and describe those that match no earlier view."""
+    """Return the scene and detections of a frame, and ``keys`` plus the newly described objects."""
     frame, settings = given.frame, perceiver.settings
     scene = detect(frame, up=given.up, settings=settings.detection, rng=_rng(settings, frame, 0))
     clock.lap("detect")
@@ -232,10 +234,7 @@ def _copy_for(frame: Frame, first: Perception) -> Perception:
 
 
 def _restrict_to(frame: Frame, perceived: Frame, perception: Perception) -> Perception:
-    """Remove from the candidates the pixels that show something else in the frame itself.
-
-    ``perceived`` is the frame after fusion with earlier ones.
-    """
+    """Remove from candidates found in ``perceived`` the pixels that ``frame`` does not confirm."""
     if perceived is frame:
         return perception
     scene = keep_same_surface(perception.scene, frame, perceived)
@@ -280,7 +279,7 @@ def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:
 def _describe(
     frame: Frame, scene: Scene, candidate: Candidate, settings: Settings, rng: np.random.Generator
 ) -> _Shape:
-    """Move a candidate to the level frame, its support at z = 0; learn and describe its surface."""
+    """Learn and describe the surface of a candidate in the level frame, its support at z = 0."""
     begun = time.perf_counter()
     points, level = level_points(frame, scene, candidate)
     cloud = thin(points.astype(np.float32), settings=settings.surface)

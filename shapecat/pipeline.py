@@ -172,7 +172,7 @@ def _run_once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]
 def _add_outputs(
     job: Job, recording: Recording, planned: RunInfo, content: ContentDigest, observe: Observer
 ) -> Summary:
-    """Write the requested outputs that a complete folder lacks, and return its summary.
+    """Write the outputs that ``planned`` requests and a complete folder lacks; return its summary.
 
     Raises
     ------
@@ -205,7 +205,7 @@ def _add_outputs(
 
 
 def track(folder: Path, run: RunInfo, job: Job) -> None:
-    """Track the detections and fuse their posteriors; write tracks.parquet and tracks.csv.
+    """Track the detections, write tracks.parquet and tracks.csv, and count the tracks in ``run``.
 
     Raises
     ------
@@ -219,7 +219,7 @@ def track(folder: Path, run: RunInfo, job: Job) -> None:
 
 
 def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer = ignore) -> None:
-    """Write review.rrd and annotated.mcap from the tables and the recording.
+    """Write review.rrd and annotated.mcap, as far as requested and not yet written.
 
     Raises
     ------

@@ -118,7 +118,7 @@ def recognize_ball() -> str:
 
 
 def find_mask() -> int:
-    """Find the mask of a square on a registered image and on another; return the sum of pixels."""
+    """Find the masks of a square on a registered and an unregistered image; return their area."""
     frame = _frame_of(np.full((480, 640), 0.7))
     v, u = np.mgrid[200:240, 300:340]
     square = (v * 640 + u).ravel().astype(np.uint32)
@@ -140,7 +140,7 @@ _STAGES = ("completion", "description", "detection", "learning", "reuse", "surfa
 
 
 def rehearse() -> None:
-    """Call all kernels of perception once, which compiles or loads them."""
+    """Call all kernels for depth images once, which compiles or loads them."""
     for rehearsal in _REHEARSALS:
         rehearsal()
 
@@ -148,7 +148,7 @@ def rehearse() -> None:
 def compile_all(observe: Observer = ignore, *, cores: int = 2, colour: bool = False) -> float:
     """Compile the kernels in other processes unless that is done; return the seconds it took.
 
-    Only one process at a time compiles; others wait for it.
+    If another call, here or in another process, is compiling them, wait for it.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def _rehearse(
 
 
 def _uncollected(rehearsal: Callable[[], object]) -> None:
-    """Compile without garbage collection, in a short-lived process; saves a twelfth of the time."""
+    """Call ``rehearsal`` without garbage collection, a twelfth faster; for short-lived workers."""
     gc.disable()
     rehearsal()
 
@@ -244,7 +244,7 @@ def _uncollected(rehearsal: Callable[[], object]) -> None:
 def _count() -> int:
     """Return the number of kernels that are compiled and stored."""
     folders = (code_folder(Path(__file__).with_name(stage)) for stage in (*_STAGES, "colour"))
-    found = (os.walk(folder) for folder in folders if folder is not None)  # also if it disappears
+    found = (os.walk(folder) for folder in folders if folder is not None)  # which may disappear
     names = (name for walk in found for _, _, files in walk for name in files)
     return sum(name.endswith(".nbi") for name in names)
 
