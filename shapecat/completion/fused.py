@@ -75,8 +75,8 @@ class FusedBox(NamedTuple):
     def in_views(self, centers: F8, axes: F8, sizes: F8) -> tuple[F8, F8]:
         """Return centre (k, 3) and axes (k, 3, 3) of the box in each view of the object.
 
-        A view that shows the object elsewhere, or turned, keeps its own centre and yaw. The boxes
-        of the views are as in `BoxViews`.
+        A view that shows the object elsewhere, or turned, keeps its own centre, and its yaw modulo
+        90 degrees. The parameters are the boxes of the views, as in `BoxViews`.
         """
         still = _near(centers, self.place)
         if not self.round:
@@ -123,7 +123,7 @@ def fuse_boxes(views: BoxViews, weights: F8, posterior: F8, categories: Sequence
 
 
 def _resting(centers: F8, weights: F8) -> int:
-    """Return the most central of the views that show the object where it stands longest.
+    """Return the index of the most central view at the place where the object stands longest.
 
     ``centers`` (k, 3), metres, are those of the views' boxes, ``weights`` (k,) the views' weights.
     Views of a carried object are avoided: the estimate of a box assumes an object on its support.
@@ -169,8 +169,8 @@ def _not_turned(axes: F8, sizes: F8, weights: F8) -> Bool:
 def _turned_from(base: F8, elongation: float, axes: F8, sizes: F8) -> Bool:
     """Return in which views (k,) an object has turned from a box with the axes ``base``.
 
-    Neighbouring views must agree, as a single one may err. ``elongation`` is from `_elongation`;
-    ``axes`` and ``sizes`` are as in `_not_turned`.
+    Neighbouring views must agree, as a single one may err. ``elongation`` is that of the box, as
+    from `_elongation`; ``axes`` and ``sizes`` are as in `_not_turned`.
     """
     angle, longer, count = _yaws(base, axes), _elongation(sizes), np.ones(len(axes))
     weights = _SQUARE + abs(longer)
@@ -247,7 +247,7 @@ def _turned(outlines: F8, angles: F8) -> F8:
 
 
 def _alike(axes: F8, sizes: F8, size: F8) -> F8:
-    """Return axes (k, 3, 3), turned by 90 degrees where the longer side is not that of ``size``.
+    """Return axes (k, 3, 3), turned by 90 degrees if the longer side is the shorter of ``size``.
 
     ``sizes`` (k, 3) are the lengths along these axes, ``size`` (3,) those of the fused box.
     """

@@ -115,7 +115,7 @@ def fit_oval(outline: F8, facing_weights: F8, roundness: float) -> tuple[F8, flo
     Returns
     -------
     The support function (`DIRECTIONS`,) of the oval, its mean radius, and the root mean square
-    deviation of the directions that face a sensor; metres.
+    deviation of the outline from it, in the directions that face a sensor; metres.
     """
     rows = np.ones((5, outline.size))
     rows[0], rows[1] = COSINES, SINES

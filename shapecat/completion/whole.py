@@ -177,9 +177,10 @@ def footprint(outline: F8, facing: F8, posterior: F8, categories: Sequence[str])
 
 
 def _visible_outline(points: F4, facing: Bool, category: str) -> F8:
-    """Return the `support_function` (96,) of points (n, 3), metres, with the prior of a category.
+    """Return the outline (96,), metres, of the visible points of an object, without outliers.
 
-    ``facing`` (96,) says which directions face the sensor.
+    ``points`` (n, 3) are in the level frame, metres; ``facing`` (96,) says which directions face
+    the sensor. The prior of ``category`` tells how many points are outliers.
     """
     x, y = np.ascontiguousarray(points[:, :2].T)
     prior = _PRIORS.get(category, _OutlinePrior())

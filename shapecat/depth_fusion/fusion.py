@@ -80,9 +80,9 @@ def keep_same_surface(scene: Scene, frame: Frame, perceived: Frame) -> Scene:
 
     Parameters
     ----------
-    scene : the result of detection on ``perceived``.
-    frame : a single frame that ``perceived``, fused or earlier, stands for. Pixels without depth in
-        it, or with the depth of another surface, are removed.
+    scene : the result of detection on ``perceived``; returned unchanged for point clouds.
+    frame : pixels without depth in this frame, or with the depth of another surface, are removed.
+    perceived : the frame in which ``scene`` was detected instead of ``frame``: fused, or earlier.
     """
     if frame.depth is None or perceived.depth is None:
         return scene
@@ -99,7 +99,7 @@ def keep_same_surface(scene: Scene, frame: Frame, perceived: Frame) -> Scene:
 
 
 def _homography(camera: Camera, earlier_from_sensor: Pose) -> tuple[F4, F4]:
-    """Return H (3, 3) and h (3,), which map pixels of this image to pixels of an earlier one.
+    """Return H (3, 3) and h (3,), which map current pixels to pixels of an earlier image.
 
     The point at depth z in pixel (u, v) has the depth z' and the pixel (u', v') in the earlier
     image, where ``(z' u', z' v', z') = z * H @ (u, v, 1) + h``.
@@ -111,10 +111,10 @@ def _homography(camera: Camera, earlier_from_sensor: Pose) -> tuple[F4, F4]:
 
 @kernel
 def _expected_depth(depth: F4, range_m: float) -> F4:
-    """Return the expected depths (h, w), metres: measured depths, and those of holes, negated.
+    """Return the depths (h, w), metres, to compare with earlier images; negative for holes.
 
-    The depth of a hole is that of a pixel in the same row or column, at most `REACH` away. It is 0
-    if there is none. Depths beyond the range are 0, too.
+    A hole gets the negative depth of the nearest pixel in its row or column, at most `REACH` away.
+    It is 0 if there is none. Depths beyond the range are 0, too.
     """
     rows, columns = depth.shape
     expected = np.zeros((rows, columns), np.float32)
@@ -141,7 +141,7 @@ def _expected_depth(depth: F4, range_m: float) -> F4:
 
 @kernel
 def _agreeing_share(expected: F4, earlier: F4, homography: F4, shift: F4) -> float:
-    """Return the fraction of pixels with depth in both images whose depths agree.
+    """Return the fraction of the compared pixels, with depth in both images, whose depths agree.
 
     ``expected`` (h, w) is from `_expected_depth`, ``homography`` and ``shift`` from `_homography`;
     ``earlier`` (h, w) are the depths of the earlier image, metres.
@@ -181,8 +181,8 @@ def _add_unmoved(expected: F4, earlier: F4, total: F4, count: F4) -> None:
 def _add_moved(expected: F4, earlier: F4, homography: F4, shift: F4, total: F4, count: F4) -> None:
     """Add the earlier depths that agree to ``total`` (h, w), and their number to ``count`` (h, w).
 
-    A hole that gets a depth also gets it in ``expected``. The other parameters are as in
-    `_agreeing_share`.
+    They are converted to depths in the current camera. The depth of a hole is also written to
+    ``expected``. The other parameters are as in `_agreeing_share`.
     """
     agree, jump = np.float32(AGREE), np.float32(DISCONTINUITY)
     coordinates = np.zeros((3, expected.shape[1]), np.float32)

@@ -35,6 +35,7 @@ class RecentFrames:
     def before(self, frame: Frame, fixed_from_sensor: Pose | None) -> tuple[Earlier, ...]:
         """Return the earlier frames to fuse with this one, the newest first, and keep this one.
 
+        ``fixed_from_sensor`` is the pose of the sensor in the fixed frame; None if it is unknown.
         Earlier frames are dropped after a jump of the clock, a gap, a change of the camera or the
         sensor frame, and when the pose becomes known or unknown. Point clouds are not fused:
         without pixels, depths of an object that has moved away cannot be recognised.
