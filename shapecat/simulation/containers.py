@@ -70,7 +70,7 @@ class _Bag:
     def __init__(
         self, ros_version: int, writer: Any, options: Callable[[bool], dict[str, Any]]
     ) -> None:
-        """Write with ``writer``, a writer of rosbags, messages of this version of ROS."""
+        """Write messages of this version of ROS with ``writer``, a writer of rosbags."""
         self.messages = MessageFactory(ros_version)
         self._file, self._options = writer, options
         self._connections: dict[str, Any] = {}

@@ -193,7 +193,7 @@ def write_frame(
 
 
 def _write_colour(writer: Container, world: World, frame: Frame) -> U1:
-    """Write the colour image of a frame; return its pixel labels (h, w)."""
+    """Write the colour image of a frame and its camera info; return the pixel labels (h, w)."""
     make, stamp = writer.messages, frame.stamp_ns
     colours, labels = render_colour(world, frame.index)
     lens, logged = COLOUR_LENS, stamp + _LATENCY_NS + _LATENCY_NS // 2

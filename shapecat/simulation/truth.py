@@ -1,4 +1,4 @@
-"""Ground truth of a frame."""
+"""Ground truth of a simulated frame."""
 
 from typing import Any
 
@@ -17,8 +17,8 @@ LISTED_PIXELS = 100
 AMBIGUOUS_PIXELS = 250
 """Objects with fewer visible depth pixels than this have an ambiguous category."""
 AMBIGUOUS_SHARE = 0.4
-"""The category of an object is also ambiguous if less than this fraction of its pixels is visible,
-compared with a view that nothing occludes."""
+"""The category of an object is also ambiguous if it has less than this fraction of the pixels that
+it would have if nothing occluded it."""
 
 
 def frame_truth(world: World, frame: int, labels: U1, camera: Camera) -> dict[str, Any]:

@@ -77,8 +77,8 @@ def _paint(
 ) -> U1:
     """Return the shaded colours (h, w, 3), uint8, of an image; textures move with their objects.
 
-    ``frame`` is the number of the frame, ``pose`` is ``world_from_camera``; the other parameters
-    are as for `_colour_in`.
+    ``image`` is frame number ``frame``, rendered with the intrinsics ``camera`` at ``pose``,
+    ``world_from_camera``. ``rows`` and ``columns`` are as for `_colour_in`.
     """
     supports = len(world.supports)
     poses = [pose] * supports  # from the camera to the frame of each texture

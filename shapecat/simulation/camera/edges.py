@@ -85,9 +85,9 @@ def _match_windows(
 ) -> None:
     """Give each pixel the surface that covers most of its window, as stereo matching does.
 
-    ``inverse``, ``mesh_ids`` and ``cosine`` (h, w) are the image; the results go to ``out``,
-    ``ids_out`` and ``cos_out``. The window extends ``radius`` pixels to each side. ``shift`` (h, w)
-    displaces edges, pixels: where it is positive, nearer surfaces grow.
+    ``inverse``, ``mesh_ids`` and ``cosine`` (h, w) are the image; ``out``, ``ids_out`` and
+    ``cos_out``, at first copies of it, get the result. The window extends ``radius`` pixels to each
+    side. ``shift`` (h, w) displaces edges, pixels: where it is positive, nearer surfaces grow.
     """
     height, width = inverse.shape
     step = max(radius // 3, 1)
@@ -129,7 +129,7 @@ def _match_windows(
 
 @kernel
 def drop_margins(inverse: F8, width: int, lost: Bool) -> None:
-    """Mark as ``lost`` (h, w) pixels up to ``width`` rows and columns beside a nearer surface."""
+    """Mark in ``lost`` (h, w) pixels at most ``width`` rows and columns from a nearer surface."""
     height, columns = inverse.shape
     nearest = np.zeros(inverse.shape)
     for v in range(height):
@@ -149,7 +149,7 @@ def drop_margins(inverse: F8, width: int, lost: Bool) -> None:
 
 @kernel
 def _blend(inverse: F8, radius: int, out: F8) -> None:
-    """Average the inverse depth (h, w) over a window at edges along rows; write it to ``out``.
+    """Average the inverse depth (h, w) over a window where a row crosses an edge, into ``out``.
 
     The window extends ``radius`` pixels to each side. Elsewhere, the inverse depth is copied.
     """

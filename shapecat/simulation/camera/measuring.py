@@ -118,9 +118,9 @@ def _drop_random_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
 
 
 def _smoothed(inverse: F8, width: int, limit: float) -> F8:
-    """Average inverse depth (h, w) over windows, not beyond discontinuities of more than ``limit``.
+    """Average inverse depth (h, w) over windows that end at discontinuities of ``limit``, 1/m.
 
-    It rounds the edges and corners of surfaces. Windows are ``width`` pixels wide, limits in 1/m.
+    This rounds the edges and corners of surfaces. The windows are ``width`` pixels wide and high.
     """
     for _ in range(2):  # along the rows, then along the columns
         along = np.zeros_like(inverse)
@@ -131,11 +131,11 @@ def _smoothed(inverse: F8, width: int, limit: float) -> F8:
 
 @kernel
 def _write_depth(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, mesh_ids: I4) -> None:
-    """Add the error, quantize, and write the depth, metres; set mesh ids without depth to -1.
+    """Write the measured depth, metres, to ``depth``; set the mesh ids without depth to -1.
 
-    All arrays but ``limits`` are (h, w). ``inverse`` and ``error`` are in 1/m; ``lost`` pixels get
-    no depth. ``limits`` (3,): quantization step of the inverse depth (0: none), least and greatest
-    depth.
+    All arrays but ``limits`` are (h, w). ``inverse`` and its ``error`` are in 1/m; ``lost`` pixels
+    get no depth. ``limits`` (3,): quantization step of the inverse depth (0: none), least and
+    greatest depth. ``depth`` must be 0 at first.
     """
     step, nearest, farthest = limits
     for v in range(inverse.shape[0]):
@@ -216,9 +216,10 @@ def _fill_shadow(inverse: F8, mesh_ids: I4, shadow: Bool, growth_px: I4) -> None
 
 @kernel
 def _smooth(inverse: F8, radius: int, limit: float, out: F8) -> None:
-    """Average inverse depth (h, w) along rows, up to ``radius`` pixels to each side, to ``out``.
+    """Write to ``out`` the inverse depth (h, w), averaged along rows.
 
-    The average ends at discontinuities of ``limit``, 1/m.
+    The average extends ``radius`` pixels to each side, but ends at discontinuities of ``limit``,
+    1/m.
     """
     height, width = inverse.shape
     for v in range(height):

@@ -44,7 +44,7 @@ def noise(
 
 
 def _gain(width: int, times: int) -> float:
-    """Return the factor by which ``times`` sums over a window raise the standard deviation."""
+    """Return the gain in standard deviation of ``times`` moving sums over ``width`` samples."""
     weights = np.ones(1)
     for _ in range(times):
         weights = np.convolve(weights, np.ones(width))
@@ -91,7 +91,7 @@ def _box_sum(raw: U1 | F4, wide: int, tall: int, out: F4) -> None:
 
 @kernel
 def _interpolate(knots: F8, spacing: int, out: F4) -> None:
-    """Write to ``out`` (h, w) values between knots, ``spacing`` pixels apart, bilinearly."""
+    """Interpolate ``knots`` (k, m), ``spacing`` pixels apart, bilinearly into ``out`` (h, w)."""
     height, width = out.shape
     for v in range(height):
         i = v // spacing

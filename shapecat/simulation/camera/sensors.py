@@ -29,8 +29,8 @@ class Sensor:
     device : seed of the fixed error and of the objects' reflectance.
     edge_jitter_px : standard deviation of the displacement of depth edges, pixels.
     edge_jitter_window : (across, down) correlation window of this displacement, pixels.
-    matching_window_px : width of the window of stereo matching, pixels, which rounds the corners of
-        outlines, and edges and small steps within them; 0 for none.
+    matching_window_px : width of the stereo matching window, pixels; 0 for none. Matching rounds
+        the corners of outlines, and the edges and small steps within a surface.
     shadow_m : x positions of the light source and of other cameras, relative to this one, metres;
         depth is missing at points that are hidden from one of them.
     shadow_fill_px : mean width by which these shadows are narrower than geometry predicts, pixels.

@@ -29,7 +29,7 @@ class Footprint(Record):
     high: float
 
     def moved(self, turn: Pose) -> "Footprint":
-        """Return the footprint of the object after ``turn``, which must be about the z axis."""
+        """Return the footprint after the motion ``turn``, which may rotate it about z only."""
         about_z, (x, y, z) = turn.rotation[:2, :2].T, turn.translation
         outline, contact, top = (
             flat @ about_z + (x, y) for flat in (self.outline, self.contact, self.top)

@@ -109,7 +109,7 @@ def make_rack(rng: Generator, supports: Sequence[Support]) -> list[Support]:
 
 
 def make_bin(rng: Generator) -> tuple[Support, list[Support]]:
-    """Return the bottom and the four sides of an open bin, on the floor or 0.4 to 0.9 m high."""
+    """Return the bottom and the four sides of an open bin, on the floor or up to 0.9 m above it."""
     width, depth, tall = rng.uniform(0.3, 0.6), rng.uniform(0.25, 0.45), rng.uniform(0.1, 0.3)
     height, thick = rng.choice([0.01, rng.uniform(0.4, 0.9)]), rng.uniform(0.003, 0.012)
     bottom = _slab("bin", TABLE, (width, depth, 0.01), (0, 0, height))

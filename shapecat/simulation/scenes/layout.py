@@ -216,7 +216,7 @@ class Layout:
     def _add(
         self, piece: Piece, turn: Pose, placed: Footprint, support: Support, on_track: int | None
     ) -> None:
-        """Add a piece, turned by ``turn``, with footprint ``placed``, on a support or a track."""
+        """Add a piece, moved by ``turn``, on a support or object; ``placed`` is its footprint."""
         pose = compose(turn, piece.stable_pose.pose)
         self.objects.append(place_piece(piece, len(self.objects), pose, support, on_track))
         self._places.append(placed)

@@ -19,7 +19,7 @@ _ANYWHERE = np.array([0.6, 0.3])
 """Half the size in x and y of an area that covers any strip; `Layout.put` draws positions in it and
 rejects those outside the strip."""
 _MOVERS = ("ball", "can", "cup", "bottle", "box")
-"""Categories of moving objects; most of their objects are narrow enough for a lane."""
+"""Categories of moving objects, most of which are narrow enough for a lane."""
 
 
 def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
@@ -121,14 +121,15 @@ def _strip(support: Support, x: tuple[float, float], y: tuple[float, float]) -> 
 
 
 def _shifted(track: int, along: F8) -> Motion:
-    """Return the motion of an object by the distances ``along`` (frames,) the x axis, metres."""
+    """Return the motion of an object in x; ``along`` (frames,) are its displacements, metres."""
     return Motion(track, np.round(np.outer(along, [1.0, 0, 0]), 6))
 
 
 def _pushed(track: int, start: F8, t: F8) -> Motion:
     """Return the motion of an object that is pushed 0.4 m along x, at 0.2 m/s, from t = 0.
 
-    ``start`` (3,) is its position; ``t`` (frames,) is the time of each frame, seconds.
+    ``start`` (3,) is its position, from which it moves towards x = 0; ``t`` (frames,) is the time
+    of each frame, seconds.
     """
     distance = -np.sign(start[0] or 1.0) * 0.4
     return _shifted(track, distance * np.clip(t * 0.2 / abs(distance), 0, 1))

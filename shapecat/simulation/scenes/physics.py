@@ -26,9 +26,9 @@ _FRICTION = (0.7, 0.005, 0.002)
 _CLEARANCE_M = 0.02
 """Height of a dropped object above the highest object below it."""
 _FALL_STEPS = 75
-"""Simulation steps between two drops."""
+"""Simulation steps after each drop, before the next one."""
 _MAX_STEPS = 750
-"""Maximum number of simulation steps after the last drop."""
+"""Maximum number of simulation steps after the `_FALL_STEPS` of the last drop."""
 _STILL = 0.02
 """Speed, in m/s and rad/s, below which an object is at rest."""
 _CHECK_STEPS = 12
@@ -61,7 +61,7 @@ class SettledPose(NamedTuple):
 def settle(obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> list[SettledPose]:
     """Drop objects one by one from just above the others, and simulate until all are at rest.
 
-    The simulation ends at the latest `_MAX_STEPS` steps after the last drop.
+    The simulation ends at the latest `_FALL_STEPS` + `_MAX_STEPS` steps after the last drop.
 
     Parameters
     ----------
@@ -133,8 +133,8 @@ def _extreme_points(mesh: Mesh) -> F8:
 def _start(drop: Drop, points: F8, placed_points: Sequence[F8]) -> Pose:
     """Return the start pose of a dropped object, slightly above everything at its position.
 
-    ``points`` (n, 3) are its extreme vertices; ``placed_points`` are those of each other mesh, in
-    the world frame.
+    ``points`` (n, 3) are its extreme vertices; ``placed_points`` are the vertices (m, 3) of each
+    mesh that is already in the scene, world frame.
     """
     turned = points @ drop.rotation.T
     middle = (turned.min(axis=0) + turned.max(axis=0)) / 2

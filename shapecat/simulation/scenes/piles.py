@@ -154,7 +154,7 @@ def settled(
 
     The objects are numbered from 0 in the order of ``items``; ``drops`` says how each is dropped.
     Objects that reach ``highest_m`` metres or more above the surface of ``below`` are left out, and
-    so is all that rests on them.
+    so is everything that rests on them.
     """
     settled_poses = settle([support.mesh for support in supports], drops)
     stays = [
@@ -175,7 +175,7 @@ def settled(
 
 
 def _rests_on(mesh: Mesh, landed: SettledPose, below: Support, highest_m: float) -> bool:
-    """Return whether an object has come to rest above a support, and below ``highest_m``."""
+    """Return whether an object lies on a support and reaches less than ``highest_m`` above it."""
     points = transform(landed.pose, mesh.vertices)
     low, high = points.min(axis=0), points.max(axis=0)
     edge = below.outline[:, :2]

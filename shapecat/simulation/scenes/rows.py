@@ -153,7 +153,7 @@ class _Groups:
 
 
 def _draw_group(category: str, rng: Generator, gap: float, room: F8) -> list[_Place]:
-    """Draw a group of objects; return them layer by layer, or none if one does not fit.
+    """Draw a group of objects; return them layer by layer, or none if a single one is too large.
 
     ``gap`` is the distance between objects, ``room`` (3,) the maximum size of the group, metres.
     """
@@ -178,7 +178,7 @@ def _draw_group(category: str, rng: Generator, gap: float, room: F8) -> list[_Pl
 def _draw_row(
     category: str, rng: Generator, gap: float, count: int, headroom_m: float
 ) -> list[_Place]:
-    """Draw a row of objects of different sizes, aligned at the front, as books on a shelf.
+    """Draw a row of objects of different sizes, aligned at the front, like books on a shelf.
 
     ``count`` objects are drawn; ``gap`` is the distance between objects, metres. Objects taller
     than ``headroom_m`` are left out.

@@ -42,7 +42,7 @@ class Support(Record):
 
     @property
     def height(self) -> float:
-        """Height of its surface in the world, metres."""
+        """Height of its surface in the world, metres; only if it holds objects."""
         return float(self.outline[0, 2])
 
 
@@ -58,7 +58,8 @@ class PlacedObject(Record):
     pose : ``world_from_mesh`` at the start.
     on_support : name of the support that the object stands on; None if it stands on an object.
     on_track : track of the object that it stands on; None if it stands on a support.
-    lying, upside_down : whether its own z axis is horizontal, or points down.
+    lying : whether its own z axis is horizontal; False for boxes.
+    upside_down : whether its own z axis points down.
     tilted : whether none of its own axes is within 15 degrees of the vertical.
     """
 

@@ -34,7 +34,7 @@ def make_can(rng: Generator) -> Mesh:
 
 
 def _soda(rng: Generator, r: float, h: float) -> F8:
-    """Draw the profile (n, 2), radius and height, of a beverage can of this radius and height."""
+    """Draw the profile (n, 2), radius and z, of a drinks can with radius ``r`` and height ``h``."""
     neck, foot = r * rng.uniform(0.78, 0.92), r * rng.uniform(0.7, 0.88)
     shoulder, sunk = h * rng.uniform(0.06, 0.12), rng.uniform(0.003, 0.007)
     return np.array(
@@ -57,7 +57,7 @@ def _soda(rng: Generator, r: float, h: float) -> F8:
 
 
 def _tin(rng: Generator, r: float, h: float) -> F8:
-    """Draw the profile (n, 2), radius and height, of a tin of this radius and height."""
+    """Draw the profile (n, 2), radius and z, of a tin with radius ``r`` and height ``h``."""
     rim, sunk = rng.uniform(0.0, 0.0015), rng.uniform(0.0, 0.005)
     z = np.linspace(0.004, h - 0.004, 26)
     ribs = rng.uniform(0.0, 0.0012) * (rng.random() < 0.5)
@@ -69,7 +69,7 @@ def _tin(rng: Generator, r: float, h: float) -> F8:
 
 
 def _tube_can(rng: Generator, r: float, h: float) -> F8:
-    """Draw the profile (n, 2), radius and height, of a tube of this radius and height."""
+    """Draw the profile (n, 2), radius and z, of a tube with radius ``r`` and height ``h``."""
     lid, over = h * rng.uniform(0.03, 0.12), r * rng.uniform(0.98, 1.06)
     return np.array(
         [
@@ -85,7 +85,7 @@ def _tube_can(rng: Generator, r: float, h: float) -> F8:
 
 
 def _jar(rng: Generator, r: float, h: float) -> F8:
-    """Draw the profile (n, 2), radius and height, of a jar of this radius and height."""
+    """Draw the profile (n, 2), radius and z, of a jar with radius ``r`` and height ``h``."""
     lid, top = h * rng.uniform(0.1, 0.22), r * rng.uniform(0.84, 1.03)
     curve = rng.uniform(0.0, 0.006)
     z = np.linspace(0.1 * r, h - lid - 0.12 * r, 8)
@@ -97,7 +97,7 @@ def _jar(rng: Generator, r: float, h: float) -> F8:
 
 
 def _plain(rng: Generator, r: float, h: float) -> F8:
-    """Draw the profile (n, 2), radius and height, of a cylinder of this radius and height."""
+    """Draw the profile (n, 2), radius and z, of a cylinder with radius ``r`` and height ``h``."""
     e = rng.uniform(0.0, 0.08) * min(r, h / 2)
     taper = rng.uniform(0.96, 1.0)
     t = r * taper
@@ -203,7 +203,7 @@ def _flattened(mesh: Mesh, stretch: float, low: float, high: float, neck: float)
 
 
 def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
-    """Shift the part above z = ``low`` to one side, as the neck of a detergent bottle.
+    """Shift the part above z = ``low`` to one side, like the neck of a detergent bottle.
 
     The shift grows smoothly to ``shift``, metres, at z = ``high``, and is constant above.
     """
@@ -214,7 +214,7 @@ def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
 
 
 def _pump(rng: Generator, radius: float, height: float) -> list[Mesh]:
-    """Return the head of a lotion pump, a stem with a spout, for a bottle of this size."""
+    """Return the head of a lotion pump: a stem with a spout, for a neck of this ``radius``."""
     stem = rng.uniform(0.02, 0.045)
     thick = float(np.clip(0.35 * radius, 0.003, 0.006))
     z = height + stem
@@ -238,7 +238,7 @@ def _trigger(rng: Generator, radius: float, height: float) -> list[Mesh]:
 
 
 def make_box(rng: Generator) -> Mesh:
-    """Make a box: planar faces at right angles, with sharp or slightly rounded edges."""
+    """Make a box: a cuboid with sharp or slightly rounded edges, or rarely a gabled carton."""
     family = rng.choice(
         ["any", "packet", "book", "small", "cube", "bar", "carton"],
         p=[0.22, 0.25, 0.15, 0.15, 0.09, 0.09, 0.05],

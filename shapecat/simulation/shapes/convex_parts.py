@@ -51,7 +51,7 @@ def hollowness(mesh: Mesh) -> float:
 
 
 def _span(hull: ConvexHull, positions: F8) -> tuple[F8, F8]:
-    """Return the largest and the smallest z of a hull at horizontal positions (n, 2)."""
+    """Return the upper and lower z (n,) of a hull at positions (n, 2); upper < lower outside it."""
     upward = hull.equations[:, 2]
     flat = np.column_stack([positions, np.ones(len(positions))])
     across = flat @ hull.equations[:, [0, 1, 3]].T
@@ -64,7 +64,10 @@ def _span(hull: ConvexHull, positions: F8) -> tuple[F8, F8]:
 
 
 def _samples(mesh: Mesh) -> F8:
-    """Return sample points (n, 3) of the whole surface, at most about `_PITCH_M` apart."""
+    """Return sample points (n, 3) of the whole surface, at most about `_PITCH_M` apart.
+
+    They are farther apart in triangles with a side longer than 100 times `_PITCH_M`.
+    """
     corners = np.asarray(mesh.vertices, np.float64)[mesh.triangles]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     counts = np.ceil(longest / _PITCH_M).astype(int).clip(1, 100)
