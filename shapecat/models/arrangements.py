@@ -74,7 +74,7 @@ class ArrangedObject(NamedTuple):
     mesh : metres, in the frame of the arrangement.
     label : category, or ``unknown``.
     resting_pose : ``upright``, ``upside_down``, ``lying``, ``leaning`` or ``tilted``.
-    support_m : height of the supporting surface; in piles, of the lowest vertex.
+    support_m : height of the supporting surface, metres; for dropped objects, of the lowest vertex.
     """
 
     mesh: Mesh

@@ -44,7 +44,8 @@ def cut_fragment(view: View, rng: np.random.Generator) -> View | None:
 def remove_base(view: View, rng: np.random.Generator) -> View:
     """Remove the points near the support, as plane removal does.
 
-    The removed layer is 4 to 9 mm thick at 1 m, and thicker at larger distances.
+    The removed layer is 4 to 9 mm thick at 1 m, and thicker at larger distances. A view that has
+    no other points is returned unchanged.
     """
     distance = float(np.linalg.norm(view.eye - view.points.mean(axis=0)))
     cut = rng.uniform(0.003, 0.006) + 0.003 * distance**2 * rng.uniform(0.3, 1.0)

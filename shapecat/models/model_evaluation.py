@@ -56,6 +56,8 @@ def evaluate_model(
     Parameters
     ----------
     sets : the views of each set in `SETS`, by name.
+    seed : seed of the views of meshes.
+    jobs : number of processes.
     meshes : folder of meshes to evaluate on, if any.
     recorded : folders of labelled recordings to evaluate on.
 
@@ -106,7 +108,7 @@ def _test_views() -> list[SimulatedView]:
 
 
 def _parts(views: SimulatedViews, model: Categorizer) -> list[tuple[str, Report]]:
-    """Return the names and reports of subsets of the views, which differ in difficulty."""
+    """Return the name and report of each subset of the views; subsets differ in difficulty."""
     background = views.source == "background"
     whole = (views.source != "fragment") & ~background
     clear = clear_views(views)
@@ -166,7 +168,10 @@ def _tracks(jobs: int) -> Iterable[SimulatedView]:
 
 
 def _fused_table(tracks: dict[str, SimulatedViews], model: Categorizer) -> Table:
-    """Return a table of the accuracy after fusing several views of one placement of an object."""
+    """Return a table of the accuracy after fusing several views of one placement of an object.
+
+    ``tracks`` are the views, by the name of their data set.
+    """
     rows = []
     for name, views in tracks.items():
         report = evaluate(views.where(clear_views(views)).views, model)

@@ -77,7 +77,7 @@ def split_necks(graph: SurfaceGraph, labels: I4, n: int) -> int:
 def _distances(links: U1, spans: I4, labels: I4) -> tuple[I4, int]:
     """Return the distance of each labelled cell from the border of its label, and the cell count.
 
-    The distances (rows, columns) are uninitialised elsewhere. They count `SIDE` per cell.
+    The distances (rows, columns) are in thirds of a cell, and uninitialised elsewhere.
     ``labels`` are (rows, columns); ``links`` and ``spans`` are as in `SurfaceGraph`.
     """
     (rows, columns), count = labels.shape, 0
@@ -119,7 +119,8 @@ def _distances(links: U1, spans: I4, labels: I4) -> tuple[I4, int]:
 def _inner_first(depth: I4, labels: I4, spans: I4, columns: int, count: int) -> I4:
     """Return the flat indices (count,) of the labelled cells, farthest from the border first.
 
-    ``depth`` are from `_distances`, with ``count``; it and ``labels`` are flattened.
+    ``depth`` and ``count`` are from `_distances`; ``depth`` and ``labels`` are flattened, and have
+    ``columns`` columns. ``spans`` are as in `SurfaceGraph`.
     """
     deepest = 0
     for i in range(len(spans)):
@@ -153,11 +154,11 @@ def _root(parent: I4, basin: int) -> int:
 
 @kernel
 def _number(cells: I4, basin: I4, parent: I4, size: I4, last: int, labels: I4, n: int) -> int:
-    """Label the basins, and return the number of labels.
+    """Relabel the cells by basin, in place; return the new number of labels.
 
     ``cells`` (count,) are flat indices; ``basin`` is that of each cell, flattened like ``labels``.
     The basins 1..last are joined as ``parent`` says; ``size`` is their number of cells. The largest
-    basin of each label 1..n keeps the label; the others get new ones.
+    basin of each label 1..n keeps the label; the others get new ones, up to `max_segments`.
     """
     label, largest = unset(last + 1, np.int16), np.zeros(n + 1, np.int32)
     for p in cells:

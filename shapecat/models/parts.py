@@ -80,10 +80,10 @@ _SERIES = (
     Series("bin", 90_000, 350),
     Series("shelf_bin", 94_000, 300),
 )
-"""Random seeds below 2000 are for development, those from 100000 on for evaluation only. In piles
-and bins, objects lean, lie across each other and touch walls; in rows, similar objects nearly
-touch. With ``split``, there are more pairs of similar objects; but when all scenes were split, the
-trees merged stacked cans."""
+"""Random seeds below 2000 are for development, those from 100000 on for evaluation or for the
+rejection trees. In piles and bins, objects lean, lie across each other and touch walls; in rows,
+similar objects nearly touch. With ``split``, there are more pairs of similar objects; but when all
+scenes were split, the trees merged stacked cans."""
 _VIEWS = 4
 """Number of views of each scene, alternately from its path and from anywhere; sensors vary."""
 _OTHERS = (
@@ -146,10 +146,11 @@ def _pairs(
     object_labels: I4,
     rng: np.random.Generator,
 ) -> Iterator[tuple[F4, bool]]:
-    """Yield the features of pairs of segments, single or merged, and whether both show one object.
+    """Yield features of pairs of segments, single or merged, and whether both show the same object.
 
     Parameters
     ----------
+    split_seeds : as for `oversegment`.
     pixel_labels : (h, w) pixel labels of the scene.
     object_labels : (k,) labels of objects.
     """
@@ -212,7 +213,7 @@ def _adjacent_pairs(
 ) -> Iterator[tuple[int, int]]:
     """Yield adjacent pairs of segments, of which at least one shows an object.
 
-    Each of the two shows one object or background. ``object_of`` (n,) is from `_segment_objects`.
+    Segments that mix several are left out. ``object_of`` (n,) is from `_segment_objects`.
     """
     n = segments.parent.size
     for p in range(1, n):

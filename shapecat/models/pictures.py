@@ -29,7 +29,10 @@ class Mistake(NamedTuple):
 def worst_mistakes(
     views: Sequence[SimulatedView], model: Categorizer, *, count: int = 12
 ) -> list[Mistake]:
-    """Return up to ``count`` wrong predictions for different objects, the most confident first."""
+    """Return up to ``count`` wrong predictions for different objects, the most confident first.
+
+    Views without points are left out.
+    """
     answer = model.predict(np.array([view.descriptor for view in views]))
     mistakes = []
     for view, posterior, novelty in zip(views, answer.posteriors, answer.novelty, strict=True):
@@ -47,7 +50,7 @@ def worst_mistakes(
 
 
 def draw(path: Path, mistakes: Sequence[Mistake]) -> None:
-    """Draw the points of each view from the sensor's viewpoint, with the predicted label."""
+    """Plot the points of each view, seen from the sensor, with both labels; write the image."""
     import matplotlib as mpl  # noqa: PLC0415  only for pictures
 
     mpl.use("agg")

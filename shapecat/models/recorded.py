@@ -1,9 +1,9 @@
 """Views of real objects from hand-labelled recordings, for evaluation.
 
-A folder holds ``depth.mcap`` and ``truth.json``, a list with one entry per frame. An entry lists
-the ``objects`` of the frame. Each object has a ``category`` and a place. The place is either
-``parts``, the values of its pixels in the frame's label image (in ``labels.npz``; 1 to 9 are
-tables), or ``centroid_m`` and ``extent_m`` in the sensor frame.
+A folder holds ``depth.mcap`` and ``truth.json``, a list with one entry per frame. An entry has the
+``stamp_ns`` and ``scene`` of the frame, and its ``objects``. Each object has a ``category`` and a
+place. The place is either ``parts``, the values of its pixels in the frame's label image (in
+``labels.npz``; 1 to 9 are tables), or ``centroid_m`` and ``extent_m`` in the sensor frame.
 """
 
 import json
@@ -61,9 +61,9 @@ def _frames(folder: Path) -> Iterator[tuple[Frame, dict[str, Any]]]:
 
 
 def _best_overlap(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int | None:
-    """Return the index of the candidate with the best IoU; None if this IoU is too small.
+    """Return the index of the candidate with the best IoU; None if that is below `_OVERLAP`.
 
-    ``image`` (h, w) are the labels of the pixels, ``item`` is the truth of the object.
+    ``image`` (h * w,) are the labels of the pixels, ``item`` is the truth of the object.
     """
     of_object = np.isin(image, item["parts"])
     shares = [

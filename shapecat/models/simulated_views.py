@@ -50,7 +50,7 @@ _THIN_M = 0.03
 category: a cupboard is a box."""
 _HEIGHT = DESCRIPTOR_NAMES.index("metric.height")
 _DETECTED = 0.75
-"""Fraction of the detected objects that detection segments; the truth segments the others."""
+"""Fraction of the detected objects whose view is their detection; others get their true pixels."""
 _FRAGMENTS = 0.3
 """Fraction of the views from which a partial view is cut in addition."""
 _SETTINGS = Settings()
@@ -164,6 +164,8 @@ def describe_arrangement(
 ) -> list[SimulatedView]:
     """Describe the objects of an arrangement from several viewpoints.
 
+    Views of objects that are less than 30 % visible are left out.
+
     Parameters
     ----------
     name : prefix of the instance names.
@@ -255,7 +257,7 @@ def _segment_by_truth(
 ) -> View:
     """Return the true points of object ``k`` in its level frame.
 
-    The frame has random errors of about half a degree and 2 mm, like a frame from detection.
+    The level frame has random errors of about half a degree and 2 mm, like one from detection.
     """
     indices = np.flatnonzero((image.mesh_ids == k) & (np.asarray(image.frame.depth) > 0))
     points = image.frame.xyz(indices)

@@ -46,7 +46,7 @@ __all__ = ["Samples", "Series", "collect", "grow_rejection_trees", "label_object
 
 _GROWTH = Growth(500, 64, 0.06)
 _FOLDS = 3
-"""Number of folds in which trees classify the samples that they were not trained on."""
+"""Number of folds; the segments of each get logits from trees that are trained on the others."""
 _OBJECT = 0.5
 """A merged segment is an object if more than this fraction of its labelled cells shows objects."""
 _CHUNK = 10
@@ -194,7 +194,7 @@ def grow_rejection_trees(samples: Sequence[Samples], seed: int) -> RejectionTree
 
 
 def _grow(rows: Sequence[F4], objects: Sequence[Bool], seed: int) -> BoostedTrees:
-    """Grow trees from features (n, f) of segments, and whether each shows an object (n,)."""
+    """Grow trees from parts of the samples: features (n, f), and whether each is an object (n,)."""
     return grow(np.concatenate(rows), np.concatenate(objects), _GROWTH, seed)
 
 

@@ -60,10 +60,10 @@ def blended_edges(inverse: F8, width: int) -> F8:
 def _sample_beside(
     inverse: F8, mesh_ids: I4, cosine: F4, across: F4, down: F4, out: F8, ids_out: I4, cos_out: F4
 ) -> None:
-    """Sample the image at displaced pixels into ``out``, ``ids_out`` and ``cos_out``.
+    """Displace the edges of an image; write the result to ``out``, ``ids_out`` and ``cos_out``.
 
     ``inverse``, ``mesh_ids`` and ``cosine`` (h, w) are the image; ``across`` and ``down`` (h, w)
-    are the displacements, pixels.
+    are the displacements, pixels. A pixel displaced within its surface keeps its value.
     """
     height, width = inverse.shape
     for v in range(height):
@@ -129,7 +129,10 @@ def _match_windows(
 
 @kernel
 def drop_margins(inverse: F8, width: int, lost: Bool) -> None:
-    """Mark in ``lost`` (h, w) pixels at most ``width`` rows and columns from a nearer surface."""
+    """Mark in ``lost`` (h, w) pixels at most ``width`` rows and columns from a nearer surface.
+
+    ``inverse`` (h, w) is the inverse depth, 1/m.
+    """
     height, columns = inverse.shape
     nearest = np.zeros(inverse.shape)
     for v in range(height):

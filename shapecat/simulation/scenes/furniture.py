@@ -186,7 +186,7 @@ def make_wall(name: str, size: Sequence[float], place: Sequence[float]) -> Suppo
 
 
 def _upright(name: str, label: int, size: Sequence[float], place: Sequence[float]) -> Support:
-    """Return an upright board on the floor, centred at ``place`` (2,)."""
+    """Return an upright board of ``size`` (3,) on the floor, centred at ``place`` (2,)."""
     return _board(name, label, size, (*place, 0.0))
 
 

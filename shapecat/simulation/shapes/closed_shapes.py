@@ -148,7 +148,7 @@ def make_bottle(rng: Generator) -> Mesh:
 
 
 def _bottle_side(rng: Generator, family: str, body: float) -> F8:
-    """Return the profile (radius, z) of a bottle's body, from its foot to its shoulder.
+    """Return the profile (n, 2), radius and z, of a bottle's body, from its foot to its shoulder.
 
     The bottle has height 1 and radius 1; its body ends at z = ``body``.
     """
@@ -162,7 +162,7 @@ def _bottle_side(rng: Generator, family: str, body: float) -> F8:
 
 
 def _bottle(rng: Generator, side: F8, shoulder: float, neck: float, *, tip: bool) -> F8:
-    """Return the profile (radius, z) of a bottle of height 1 and radius 1.
+    """Return the profile (n, 2), radius and z, of a bottle of height 1 and radius 1.
 
     ``side`` is the profile of its body, ``shoulder`` a height, ``neck`` a radius; ``tip`` narrows
     the cap to a tip.
@@ -214,7 +214,7 @@ def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
 
 
 def _pump(rng: Generator, radius: float, height: float) -> list[Mesh]:
-    """Return the head of a lotion pump: a stem with a spout, for a neck of this ``radius``."""
+    """Return the head of a lotion pump, a stem with a spout; ``radius`` is that of the neck."""
     stem = rng.uniform(0.02, 0.045)
     thick = float(np.clip(0.35 * radius, 0.003, 0.006))
     z = height + stem

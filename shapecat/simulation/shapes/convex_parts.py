@@ -105,7 +105,7 @@ def _thickened(points: F8) -> F8:
 
 
 def _corners(points: F8, directions: F8) -> F8:
-    """Return the point of ``points`` farthest along each direction, without duplicates: (k, 3)."""
+    """Return the points (k, 3) that are farthest along one of the directions (m, 3)."""
     return np.asarray(points[np.unique((points @ directions.T).argmax(axis=0))])
 
 

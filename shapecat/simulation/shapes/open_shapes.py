@@ -196,7 +196,7 @@ def _section(rng: Generator, *, oval: float, square: float, facets: float) -> di
 
 
 def _handle_shape(rng: Generator, diameter: float, height: float) -> tuple[F8, float, float]:
-    """Draw a handle: its curve (k, 2), its radius and its flatness.
+    """Draw a handle for a cup of this size: its curve (k, 2), its radius and its flatness.
 
     The columns of the curve are the distance from the wall and the height above its middle, metres.
     """

@@ -173,7 +173,10 @@ def rounded_box(size: ArrayLike, *, radius: float = 0.0, bulge: float = 0.0, fin
 
 
 def _box_lines(half: float, radius: float, fine: int) -> F8:
-    """Return the coordinates (n,) of the grid lines on a face, dense where the edges are round."""
+    """Return the coordinates (n,) of the grid lines on a face, dense where the edges are round.
+
+    They reach from -``half`` to ``half``; ``radius`` and ``fine`` are as for `rounded_box`.
+    """
     flat = np.linspace(radius - half, half - radius, fine + 1)
     if radius <= 0:
         return flat

@@ -78,7 +78,7 @@ def uprighted(mesh: Mesh, category: str) -> Mesh:
 
 
 def _roundness(points: F8) -> float:
-    """Return the smallest width of the outline, seen along z, divided by the largest width."""
+    """Return the smallest width of points (n, 3), seen along z, divided by the largest width."""
     angle = np.arange(16) * (np.pi / 16)
     flat = points[:, :2] @ [np.cos(angle), np.sin(angle)]
     widths = np.ptp(flat, axis=0)
