@@ -199,7 +199,7 @@ def _elongation(sizes: F8) -> F8:
 
 
 def _mean_axes(axes: F8, sizes: F8, weights: F8) -> F8:
-    """Return the first of the axes (k, 3, 3), turned to the mean yaw of all, modulo 90 degrees.
+    """Return the mean axes (3, 3): the first of ``axes``, turned to the mean yaw modulo 90 degrees.
 
     The parameters are as in `_not_turned`.
     """

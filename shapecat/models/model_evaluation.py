@@ -101,7 +101,7 @@ def evaluate_model(
 
 
 def _test_views() -> list[SimulatedView]:
-    """Return the views of a few test arrangements that `clear_views` selects, with their points."""
+    """Return the clear views, with points, of a few test arrangements; see `clear_views`."""
     options = replace(options_of("test"), keep=True)
     views = [view for number in range(_DRAWN) for view in simulate_arrangement(options, number)]
     return [view for view, clear in zip(views, clear_views(collect(views)), strict=True) if clear]
@@ -160,7 +160,7 @@ def _counts(sets: dict[str, SimulatedViews]) -> list[tuple[str, ...]]:
 
 
 def _tracks(jobs: int) -> Iterable[SimulatedView]:
-    """Simulate tables, each from many viewpoints."""
+    """Yield views of the objects on simulated tables, each seen from many viewpoints."""
     options = ArrangementOptions(
         _TRACK_SEED, tuple(DISTRACTORS), unknown=0.0, cameras=max(FUSED) + 6
     )

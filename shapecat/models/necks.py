@@ -31,7 +31,7 @@ def split_necks(graph: SurfaceGraph, labels: I4, n: int) -> int:
 
     Parameters
     ----------
-    graph : the links between cells; regions end where they are missing.
+    graph : the links between cells; regions end where links are missing.
     labels : (rows, columns) 1..n, 0 elsewhere; changed in place.
     n : number of labels.
 

@@ -1,7 +1,7 @@
 """Grow the trees that decide which segments to merge: ``python -m shapecat.models.parts``.
 
 Simulated scenes, seen by all sensors, give pairs of segments. The segments of each object are
-merged in random order. The trees learn from all pairs that occur on the way, so that they also know
+merged in random order. The trees learn from all pairs that occur during merging, and thus also from
 partially merged segments.
 """
 

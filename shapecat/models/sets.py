@@ -42,7 +42,7 @@ WELL_SEGMENTED_IOU = 0.75
 MOSTLY_VISIBLE = 0.7
 """Minimum visible fraction of a mostly visible object."""
 _TIMES = 3
-"""How many times as often a procedural family is drawn as another kind of distractor."""
+"""Weight of each procedural family of distractors; other kinds have weight 1."""
 
 
 class SimulatedViews(NamedTuple):

@@ -139,7 +139,7 @@ class Samples(NamedTuple):
 
     Attributes
     ----------
-    features : (n,) `OBJECT_FEATURES`.
+    features : (n,) records of `OBJECT_FEATURES`.
     objects : (n,) whether each segment shows an object.
     weights : for each frame, the border lengths of its segments, from `measure_borders`.
     """
@@ -173,7 +173,7 @@ def collect(scenes: tuple[Series, ...], jobs: int) -> list[Samples]:
 def grow_rejection_trees(samples: Sequence[Samples], seed: int) -> RejectionTrees:
     """Grow the trees that classify segments alone, and those that classify them in context.
 
-    The trees in context learn only from the segments of which the first trees are uncertain. The
+    The trees in context learn only from segments about which the first trees are uncertain. The
     logits of these segments come from trees that were trained on other parts of the samples.
     """
     rows = [as_rows(part.features) for part in samples]

@@ -122,8 +122,8 @@ class Layout:
 
         Parameters
         ----------
-        half : (2,) half the size along x and y, metres, of the area in which to place it, around
-            the support's centre.
+        half : (2,) half the size in x and y, metres, of the area around the support's centre in
+            which to place it.
         stack : probability of placing it on another object.
         attempts : number of objects to make and try before giving up.
         """

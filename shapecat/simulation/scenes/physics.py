@@ -38,7 +38,7 @@ _WAITING_M = 5.0
 
 
 class Drop(NamedTuple):
-    """An object to drop: its rotation (3, 3) and horizontal position (2,), world frame, metres."""
+    """An object to drop: its rotation (3, 3) and the x and y (2,) of its middle, metres, world."""
 
     mesh: Mesh
     rotation: F8

@@ -26,8 +26,8 @@ class Support(Record):
     label : pixel label, 1 to 9. Supports that hold objects need different labels; otherwise, the
         ground truth counts their pixels together.
     mesh : metres, world frame.
-    outline : (k, 3) corners of its horizontal surface, metres, world frame; empty, as by default,
-        if nothing can stand on it, as for a wall.
+    outline : (k, 3) corners of its horizontal surface, metres, world frame; empty (the default) if
+        nothing can stand on it, as on a wall.
     """
 
     name: str
