@@ -41,7 +41,7 @@ _UNLOCKED_S = 60
 
 
 def partial_path(path: Path) -> Path:
-    """Return the hidden name that a file or folder has until it is complete.
+    """Return the hidden path of a file or folder until it is complete.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def partial_path(path: Path) -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Provide a hidden path; rename it to ``path`` when the block succeeds.
+    """Provide a hidden path; rename it to ``path`` if the block succeeds, else delete it.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def require_utf8(path: Path, kind: type[ShapecatError] = OutputError) -> None:
 
     Raises
     ------
-    ShapecatError : it is not; the error is of the given kind.
+    ShapecatError : it is not; ``kind`` is the type of this error.
     """
     absolute = path.absolute()
     try:
@@ -108,9 +108,9 @@ def require_utf8(path: Path, kind: type[ShapecatError] = OutputError) -> None:
 
 @contextmanager
 def complete_folder(folder: Path) -> Iterator[Path]:
-    """Provide a hidden folder; rename it to ``folder`` when the block succeeds.
+    """Provide a hidden folder; rename it to ``folder`` if the block succeeds.
 
-    Remains of an earlier, interrupted block are deleted first.
+    If not, the hidden folder is left behind, and the next call deletes it first.
     """
     hidden = partial_path(folder)
     shutil.rmtree(hidden, ignore_errors=True)
@@ -151,8 +151,12 @@ def lock(path: Path, *, wait: bool = False) -> int | None:
 
     Returns
     -------
-    The file descriptor; None if another process holds the lock and ``wait`` is False. On a file
-    system without locks, every call succeeds.
+    The file descriptor; None if another thread or process holds the lock and ``wait`` is False. On
+    a file system without locks, every call succeeds.
+
+    Raises
+    ------
+    OSError : the path does not exist or cannot be opened.
     """
     descriptor = os.open(path, os.O_RDONLY)
     try:

@@ -8,13 +8,13 @@ from typing import Any
 __all__ = ["block_unused"]
 
 _BLOCKED_FOR = {"scipy.linalg": "numba.np.linalg", "coverage": "numba.misc.coverage_support"}
-"""Blocked modules, each with the only module of numba for which it is blocked."""
+"""Blocked modules, each with the module of numba that must not import it; others may."""
 
 
 class _Blocker(MetaPathFinder):
-    """Blocks pandas, and modules that numba looks for but does not need, even if installed.
+    """Blocks pandas, and modules that numba imports if they are installed but does not need.
 
-    None in `sys.modules` would do the same, but scikit-learn looks for a module there.
+    None in `sys.modules` would block them too, but scikit-learn takes any value there for a module.
     """
 
     def find_spec(self, fullname: str, *_: Any) -> None:
@@ -27,7 +27,7 @@ class _Blocker(MetaPathFinder):
 
 
 def _is_caller(module: str) -> bool:
-    """Return whether a module is among the callers."""
+    """Return whether code of the module with this name is on the call stack."""
     frame: FrameType | None = sys._getframe()  # noqa: SLF001  inspect takes longer
     while frame is not None and frame.f_globals.get("__name__") != module:
         frame = frame.f_back

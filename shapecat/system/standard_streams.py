@@ -1,4 +1,4 @@
-"""Keep a command at work when nobody can read its messages or its output."""
+"""Keep a command running when nobody can read its messages or its output."""
 
 import io
 import os

@@ -88,10 +88,10 @@ def stop_message(text: str) -> Iterator[None]:
 
 @contextmanager
 def handling_signals() -> Iterator[None]:
-    """Store SIGINT and SIGTERM during the block instead of raising.
+    """Store SIGINT and SIGTERM during the block instead of raising; forget them at its end.
 
     Ignored signals, such as SIGINT in a background job, stay ignored. Outside the main thread,
-    which alone may handle signals, nothing changes.
+    which alone may handle signals, the handlers do not change.
     """
     before = {}
     if threading.current_thread() is threading.main_thread():
