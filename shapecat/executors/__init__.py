@@ -45,7 +45,8 @@ def open_executor(name: str, *, workers: int, address: str | None = None) -> Wor
 
     Raises
     ------
-    ConfigError : the library is not installed, or nothing answers at the address.
+    ConfigError : the library is not installed, nothing answers at the address, or ``local`` is
+        given an address.
     """
     if name == "dask":
         from shapecat.executors.dask import open_dask  # noqa: PLC0415  an extra
@@ -62,7 +63,7 @@ def open_executor(name: str, *, workers: int, address: str | None = None) -> Wor
 
 
 def is_lost(error: BaseException) -> bool:
-    """Return whether an error means that the worker or scheduler is lost, not a failed task."""
+    """Return whether an error means a lost worker or scheduler rather than a failed task."""
     return type(error).__name__ in _LOST | _DROPPED
 
 

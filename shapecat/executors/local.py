@@ -94,7 +94,10 @@ class LocalExecutor(WorkerExecutor):
         self._end(lambda worker: worker.process.kill(), timeout_s=1)
 
     def _end(self, end: Callable[[Worker], object], *, timeout_s: float | None = None) -> None:
-        """Cancel waiting tasks, call ``end`` for all workers, and wait for their dispatchers."""
+        """Cancel waiting tasks, call ``end`` for all workers, and wait for their dispatchers.
+
+        ``timeout_s`` is the longest wait for each dispatcher, seconds; None for no limit.
+        """
         self.shutdown(wait=False, cancel_futures=True)
         with self._lock:
             for worker in self._workers.values():
@@ -141,7 +144,7 @@ class LocalExecutor(WorkerExecutor):
                     raise WorkerLostError(msg)
                 try:
                     self._workers[slot] = Worker(capacity)
-                except (OSError, RuntimeError) as error:  # of processes, and of threads
+                except (OSError, RuntimeError) as error:  # no more processes, or no more threads
                     msg = f"{_NOT_STARTED}: {error}"
                     raise WorkerLostError(msg) from error
             return self._workers[slot]

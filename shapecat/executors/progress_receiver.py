@@ -28,7 +28,7 @@ class ProgressReceiver:
     """
 
     def __init__(self, receive: Callable[[Any], None]) -> None:
-        """Call ``receive`` with each message."""
+        """Call ``receive`` with each message, in the thread that listens."""
         self._receive = receive
         self._folder = ExitStack()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -69,7 +69,10 @@ class ProgressReceiver:
 
 
 def send_progress(address: str, message: Any) -> None:
-    """Send a message without waiting; drop it if that fails, for example on another machine."""
+    """Send a JSON value without waiting; drop it if that fails, for example on another machine.
+
+    ``address`` is that of the `ProgressReceiver`.
+    """
     with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
         sender.setblocking(False)  # noqa: FBT003  positional by definition
         sender.sendto(json.dumps(message).encode(), address)

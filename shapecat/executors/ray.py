@@ -23,7 +23,7 @@ class RayExecutor(WorkerExecutor):
 
         Raises
         ------
-        ConfigError : Ray is not installed, or no cluster answers.
+        ConfigError : Ray is not installed or does not start, or no cluster answers.
         """
         try:
             import ray  # noqa: PLC0415  an extra
@@ -44,7 +44,7 @@ class RayExecutor(WorkerExecutor):
             problem = f"--scheduler {address}: no Ray cluster answers"
             msg = f"{problem if address else '--executor ray: Ray does not start'}: {error}"
             raise ConfigError(msg) from error
-        self._call = ray.remote(max_retries=0)(_call)  # once: the cluster keeps each
+        self._call = ray.remote(max_retries=0)(_call)  # once: the cluster keeps every copy
         self._running: set[Any] = set()
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:

@@ -55,7 +55,7 @@ class Worker:
         self.lost = False
         self._socket, child_socket = socket.socketpair()
         stop_pipe, self._stop_pipe = _SPAWN.Pipe(duplex=False)
-        # Not daemonic, since those may not start processes; `_watch_parent` ends it instead.
+        # Daemonic processes may not start others, so `_watch_parent` ends this one.
         self.process = _SPAWN.Process(target=_serve, args=(child_socket, stop_pipe), daemon=False)
         with single_threaded():
             self.process.start()
