@@ -30,9 +30,11 @@ def agreement(
     Returns
     -------
     The fraction of the compared points that agree with ``other``, and the mean inverse depth, in
-    1/m, by which ``other`` sees these points nearer; (0, 0) if too few points have depth there.
+    1/m, by which ``other`` sees the agreeing points nearer; (0, 0) if too few points have depth
+    there or none agrees.
     """
-    turn = np.array(other_from_one.rotation, order="C")  # writable, in C order: one version
+    # Writable, in C order, so that the kernel is compiled only once.
+    turn = np.array(other_from_one.rotation, order="C")
     shift = other_from_one.translation
     compared, agreeing, total = _compare(
         pixels, depth, _numbers(camera), other, _numbers(other_camera), turn, shift
@@ -64,7 +66,7 @@ def _compare(
     turn: F8,
     shift: F8,
 ) -> tuple[int, int, float]:
-    """Return the numbers of points compared and in agreement, and the sum of their differences.
+    """Return the numbers of compared and agreeing points, and the latter's summed differences, 1/m.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ from shapecat.types import Frame, Pose
 __all__ = ["shows_the_same"]
 
 _MOVED_M = 0.003
-"""Largest distance between two poses that count as equal, metres: so much is noise."""
+"""Largest distance between two poses that count as equal, metres: noise moves them this far."""
 _TURNED_DEG = 0.15
 """Largest angle between two poses that count as equal, degrees."""
 _STRIDE = 2
@@ -23,7 +23,7 @@ pixels, fewer than the smallest object has. Noise at outlines makes only thin li
 def shows_the_same(
     frame: Frame, pose: Pose | None, key_frame: Frame, key_pose: Pose | None, *, range_m: float
 ) -> bool:
-    """Return whether nothing within range has moved, appeared or disappeared between two frames.
+    """Return whether the sensor, its pose and the scene within range are the same in two frames.
 
     Parameters
     ----------
@@ -52,9 +52,9 @@ def _at_rest(pose: Pose | None, other: Pose | None) -> bool:
 
 @kernel
 def _changed(depth: F4, key_depth: F4, range_m: float) -> bool:
-    """Return whether there is a square of pixels whose depths (h, w) all differ.
+    """Return whether there is a square of compared pixels that all differ between two images.
 
-    ``depth`` and ``key_depth`` are the two images, metres; ``range_m`` is the range.
+    ``depth`` and ``key_depth`` are (h, w), metres, 0 where missing; ``range_m`` is the range.
     """
     height, width = depth.shape
     rows = np.zeros(width, np.int64)  # consecutive rows with a long enough run that ends here

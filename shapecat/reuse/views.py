@@ -159,9 +159,9 @@ def _repeat(view: ObjectView, key: KeyView, moves: dict[int, Move]) -> Repeat | 
 
 
 def reused(repeat: Repeat, view: ObjectView) -> Detection:
-    """Return the detection of an object that repeats a view.
+    """Return the detection of the object in ``view``, copied from the earlier view it repeats.
 
-    Its surface and full box are moved to the current sensor frame.
+    The surface and the full box are moved to the current sensor frame.
     """
     (key, move), first = repeat, repeat.key.detection
     return Detection(
@@ -224,7 +224,7 @@ _REST = Move(IDENTITY, IDENTITY, np.array([0.0, 0.0, 0.0, 1.0]))
 
 
 def _between(one: ObjectView, other: ObjectView) -> Move:
-    """Return the motion of the sensor from one view to another."""
+    """Return the motion of the sensor from one view to another; `_REST` without a fixed frame."""
     a, b = one.pose, other.pose
     if a is None or b is None:
         return _REST
