@@ -111,7 +111,7 @@ class _Awaited:
 
         Parameters
         ----------
-        topic, number : of the frame, which is among the next few awaited frames.
+        topic, number : topic and number of the frame, one of the next few awaited.
         """
         named = (one for one in self._next if (one.topic, one.index) == (topic, number))
         masks = next((one.masks for one in named), None)

@@ -19,7 +19,7 @@ from shapecat.types import Camera, Detection, Frame, LabelledFrame, LabelledObje
 __all__ = ["frame_of", "perceive_alone"]
 
 _FARTHEST_M = 100.0
-"""If the median of depths, or of largest coordinates, is larger, the unit is not metres."""
+"""Median of depths, or of each point's largest coordinate, above which they are not in metres."""
 _FIXED = ([0, 1, 2, 2, 2], [1, 0, 0, 1, 2])
 """Rows and columns of the elements that are 0 or 1 in every camera matrix without skew."""
 _SHORTEST = 0.05
@@ -73,7 +73,7 @@ def frame_of(reading: ArrayLike | Frame, intrinsics: ArrayLike | Camera | None =
 
 
 def _camera(intrinsics: ArrayLike | Camera, height: int, width: int) -> Camera:
-    """Return the camera of an image; refuse intrinsics that are malformed or implausible."""
+    """Return the camera of an image; raise `ConfigError` if the intrinsics are implausible."""
     if isinstance(intrinsics, Camera) and (intrinsics.width, intrinsics.height) == (width, height):
         return intrinsics
     with suppress(TypeError, ValueError):  # not numbers, or rows of different lengths

@@ -48,9 +48,9 @@ def png(
 
 
 def with_palette(image: bytes, palette: U1) -> bytes:
-    """Replace the palette of an image that `png` encoded by one of the same size (k, 3)."""
+    """Return a PNG made by `png` with another palette (k, 3); k must be the same."""
     chunk = _chunk(b"PLTE", np.ascontiguousarray(palette, np.uint8).tobytes())
-    start = image.index(b"PLTE") - 4  # after the length of the chunk
+    start = image.index(b"PLTE") - 4  # a chunk starts with its length
     return image[:start] + chunk + image[start + len(chunk) :]
 
 

@@ -69,7 +69,7 @@ def _below_object(candidate: Candidate) -> Sequence[Node | None]:
 
 
 def _below_plane(scene: Scene, k: int) -> Node | None:
-    """Return the object whose top is plane k, or else the highest plane below its middle."""
+    """Return the object whose top is plane k, or else the highest plane below the middle of k."""
     middle = scene.planes[k].outline.mean(axis=0)
     level = gravity_rotation(scene.up)[:2]
     for n, candidate in enumerate(scene.candidates):
@@ -85,7 +85,7 @@ def _below_plane(scene: Scene, k: int) -> Node | None:
 
 
 def _covers(plane: Plane, point: F8) -> bool:
-    """Return whether a point is within the convex outline of a plane, seen from above."""
+    """Return whether a point (3,) is within the convex outline of a plane, seen from above."""
     level = gravity_rotation(plane.normal)[:2]
     outline, (x, y) = plane.outline @ level.T, level @ point
     sides = np.roll(outline, -1, axis=0) - outline

@@ -102,7 +102,7 @@ def _candidate(row: dict[str, Any], planes: Sequence[Plane]) -> Candidate:
 def _rows(
     folder: Path, table: str, topic: str, frame: int, columns: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return the rows of a frame in ``table``; of other rows, only topic and frame are read."""
+    """Return the rows of a frame in ``table``; for other rows, only topic and frame are read."""
     path = folder / f"{table}.parquet"
     groups = read_row_groups(path, ["topic", "frame"])
     keys = enumerate(key for group in groups for key in keys_of(group))

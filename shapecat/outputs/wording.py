@@ -58,7 +58,7 @@ def time_span(first_s: float, last_s: float) -> str:
 
 
 def safe_name(text: str) -> str:
-    """Return a text as the name of a file or folder, without separators and not hidden.
+    """Return a text as a name for a file or folder: no separators, not hidden, at most 120 bytes.
 
     Letters of all scripts stay, with their accents and vowel signs.
 

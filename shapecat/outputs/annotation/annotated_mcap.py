@@ -36,7 +36,7 @@ __all__ = ["write_annotated"]
 _LIFETIME = 1.5
 """Lifetime of boxes in viewers, as a multiple of the frame period."""
 _BUFFER = 4 << 20
-"""Size of the write buffer, bytes; large, since a thread waits while another writes to the file."""
+"""Size of the write buffer, bytes; large, since each write waits for the thread that copies."""
 _PERIOD_NS = 1_000_000_000
 """Frame period assumed for a stream with a single frame."""
 _LONGEST_NS = 3600 * 10**9
@@ -66,7 +66,7 @@ def write_annotated(
     Parameters
     ----------
     frames : the boxes to show in each frame, in the order of the recording.
-    markers : whether to write ``/shapecat/markers`` for RViz, if the encoding is one of ROS.
+    markers : whether to write ``/shapecat/markers`` for RViz, if the encoding is a ROS encoding.
     images : the boxes to show on the colour images, in the order of the recording. They are
         written to ``/shapecat/image_annotations`` and, for ROS, ``/shapecat/detections_2d``, with
         the stamp, frame id and log time of the image.
@@ -176,7 +176,7 @@ def _annotations(frames: Iterable[AnnotationFrame]) -> Iterator[Annotation]:
 def _with_periods(frames: Iterable[AnnotationFrame]) -> Iterator[tuple[AnnotationFrame, int]]:
     """Yield each frame with the time to the next frame of its topic, ns.
 
-    The last frame of a topic gets the time since the frame before it.
+    If that is not among the next `_AHEAD` frames, the time since the previous one is used.
     """
     source = iter(frames)
     following = deque(islice(source, _AHEAD))
@@ -200,7 +200,10 @@ def _period(frame: AnnotationFrame, following: AnnotationFrame) -> int:
 
 
 def _encoding(recording: Recording, first: Annotation | None) -> str:
-    """Return the encoding for annotations: the annotated topic's, or else the most common one."""
+    """Return the encoding for annotations: the annotated topic's, or else the most common one.
+
+    It is CDR for a ROS 1 bag, which is converted to ROS 2, and JSON if none is supported.
+    """
     if recording.kind == "ros1":
         return "cdr"
     topics = [topic for topic in recording.topics if topic.encoding in ENCODINGS]

@@ -17,7 +17,7 @@ _T = TypeVar("_T")
 
 
 class AnnotationChannel(NamedTuple):
-    """A channel to write: its topic, the encoding of its messages, and its schema."""
+    """A channel to write: topic, encoding of the messages, schema, and (key, value) metadata."""
 
     topic: str
     encoding: str

@@ -49,7 +49,7 @@ class ImageFrame(NamedTuple):
 
 
 def read_image_frames(folder: Path, tracks: LabelledTracks) -> Iterator[ImageFrame]:
-    """Yield the objects on each colour image of a run; see `read_nearest_masks`.
+    """Yield each colour image of a run once, with the objects of the frame nearest to it in time.
 
     Images of a single row, the colours of unorganized clouds, are left out.
     """

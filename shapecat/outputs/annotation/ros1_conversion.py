@@ -93,9 +93,9 @@ def _ros2_types(channel: Channel, name: str) -> tuple[Typestore, bytes]:
 
 
 def _renamed(constants: Any, fields: Any) -> Any:
-    """Return a message definition in which ROS 2 allows the names of all fields.
+    """Return a message definition with fields renamed where ROS 2 does not allow their names.
 
-    Strict readers refuse a file with any other name.
+    Strict readers refuse a file with such a name.
     """
     names: list[str] = []
     for name, _ in fields:
