@@ -135,7 +135,7 @@ def _colours(points: F4, light: F4, tones: U2, palette: U1, planes: F4, plane_to
     Parameters
     ----------
     points : (n, 3) metres, sensor frame.
-    light : (n,) factors of brightness.
+    light : (n,) brightness factors.
     tones : (n,) indices into the palette; points of index 0 get the colour of a plane nearby.
     palette : (k, 3); the last ``plane_tones`` entries are for planes, in turn.
     planes : (p, 8), from `_plane_rows`.
@@ -170,7 +170,7 @@ def _light(depth: F4, pixels: I4, fx: float, fy: float) -> F4:
     """
     height, width = depth.shape
     result = np.ones(pixels.size, np.float32)
-    step = 3  # pixels: beyond the quantisation of the depth
+    step = 3  # pixels, enough that the quantisation of depth hardly matters
     for k in range(pixels.size):
         v, u = pixels[k] // width, pixels[k] % width
         z = depth[v, u]

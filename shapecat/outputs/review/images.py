@@ -53,7 +53,7 @@ def layer_of(visible: Sequence[tuple[LabelledObject, Mask]], height: int, width:
 
 
 _Boxes = tuple[F4, list[tuple[int, int, int]], list[str]]
-"""Boxes (n, 4) on an image, with their colours and captions."""
+"""Boxes (n, 4) on an image, as left, top, width and height in pixels; colours; captions."""
 
 
 class Images:

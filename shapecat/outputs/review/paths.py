@@ -49,7 +49,7 @@ class Paths:
     def add(
         self, entity: str, at: At, positions: Mapping[int, tuple[str, F8]], ended: Iterable[int]
     ) -> None:
-        """Add the category and position of each track in a frame; remove tracks that have ended.
+        """Add the category and position (3,) of each track in a frame; remove those that ended.
 
         A track that several sensors see has a path in the entity of each; when it ends, all its
         paths are removed.

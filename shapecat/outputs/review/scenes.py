@@ -91,7 +91,7 @@ def _first_seen(labelled: LabelledFrame) -> int:
 
 
 def _places(labelled: LabelledFrame, *, fixed: bool) -> dict[int, F8]:
-    """Return the position (3,) of each track, in the fixed frame if ``fixed`` and it is known."""
+    """Return each track's position (3,), in the fixed frame if ``fixed`` and the pose is known."""
     pose = labelled.fixed_from_sensor if fixed else None
     return {
         o.track: transform(pose or IDENTITY, (o.full or o.box).center) for o in labelled.objects

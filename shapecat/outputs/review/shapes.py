@@ -75,7 +75,7 @@ class Sketch(NamedTuple):
 
 
 def label(item: LabelledObject) -> str:
-    """Return ``#track category confidence``."""
+    """Return ``#track category confidence``; for an unknown object, without the confidence."""
     return caption(item.track, item.category, item.confidence)
 
 
@@ -90,7 +90,7 @@ def sketch(labelled: LabelledFrame) -> list[Sketch]:
 
 
 def _boxes(rows: Sequence[Sequence[Sketch]]) -> _Columns:
-    """Return the labelled boxes."""
+    """Return the labelled boxes; a row holds those of one frame."""
     every = list(chain.from_iterable(rows))
     yield from rr.Boxes3D.columns(
         centers=_stacked([o.box.center for o in every], 3),

@@ -97,7 +97,7 @@ def take_screenshot(path: Path, png: Path) -> None:
 
     Raises
     ------
-    OutputError : the file, the viewer or a renderer is missing.
+    OutputError : the file, the viewer or a renderer is missing, or the viewer fails.
     """
     from rerun.experimental import ViewerClient  # noqa: PLC0415  only a screenshot needs it
 

@@ -4,7 +4,7 @@ Entities
 --------
 ::
 
-    world                      handedness and up; the fixed frame if there is one
+    world                      the fixed frame, with its handedness and up, if there is one
     ├── paths/<topic>          paths of the tracks (below <topic> without a fixed frame)
     ├── <topic>                the sensor: fixed_from_sensor, in every frame
     │   ├── camera             pinhole, for depth images
@@ -24,7 +24,7 @@ Entities
     ├── boxes                  around the masks
     └── captions               labelled as in 3D
     tracks/<n>/posterior       fused posterior up to each frame, a line per category
-    plots/objects/<category>   objects in view; of several topics, plots/objects/<topic>/<category>
+    plots/objects/<category>   objects in view; plots/objects/<topic>/<category> if several topics
     plots/seconds/<stage>      time spent on each frame
     log                        starts and ends of tracks, warnings of the run
     run                        run.json as text
@@ -228,7 +228,7 @@ class _Review:
             self._columns.add(f"{entity}/{name}", at, scene, drawing, size=scene.size)
 
     def _place_sensor(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
-        """Write the axes and the frustum of the sensor if they are new, and choose its eye."""
+        """Write the axes and frustum of the sensor if they are new, and choose the topic's eye."""
         topic = labelled.topic
         if topic not in self._eyes or (labelled.objects and topic not in self._aimed):
             self._eyes[topic] = choose_eye(labelled, frame, fixed=self._fixed_frame is not None)
@@ -297,7 +297,7 @@ class _Review:
 
 @cache
 def _count(category: str, sensor: str) -> Drawing:
-    """Return the drawing of a count, which changes in steps."""
+    """Return the drawing of a count, in steps; ``category + sensor`` is the name of the line."""
     style = rr.SeriesLines(
         names=category + sensor,
         colors=colour_of(category),
