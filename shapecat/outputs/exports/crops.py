@@ -47,7 +47,7 @@ class Origin(NamedTuple):
 
     @classmethod
     def read(cls, instance: str) -> "Origin | None":
-        """Return the origin that the name of an instance holds; None if no run made it."""
+        """Return the origin in the name of an instance; None if the instance is not from a run."""
         if match := _INSTANCE.fullmatch(instance):
             return cls(match[1], float(match[2] or 0), float(match[3] or "inf"))
         return None
@@ -75,7 +75,7 @@ def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
 
     Raises
     ------
-    OutputError : ``out`` is not writable, or holds views of a range that only overlaps.
+    OutputError : ``out`` is not writable, or holds views of a time range covered only in part.
     """
     origin = Origin.of(finished)
     earlier = _earlier_views(out, origin)

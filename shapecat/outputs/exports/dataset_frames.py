@@ -65,7 +65,7 @@ class ImageSelection:
 class DatasetImage:
     """An image of a data set, and the objects on it.
 
-    ``name`` is the file name with suffix, ``contents`` its bytes.
+    ``name`` is the file name with suffix, ``contents`` the content of the file.
     """
 
     name: str

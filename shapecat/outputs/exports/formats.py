@@ -183,7 +183,7 @@ def _labelled_images(
     recording: Path | None,
     observe: Observer,
 ) -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
-    """Yield the images of a data set, each with its split and its run, and count them."""
+    """Yield a data set's images with split and run, and count them; raise `OutputError` if none."""
     total = sum(int(run.info["counts"]["frames"]) for run in runs)
     done, left_out = itertools.count(1), Counter[str]()
     splits = split_runs(runs, selection.val)

@@ -43,7 +43,7 @@ def write_kitti(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRu
 
     Raises
     ------
-    OutputError : two categories have the same type, but for upper and lower case.
+    OutputError : two categories have the same type, apart from upper and lower case.
     """
     _require_distinct_types(finished.categories)
     for name in ("label_2", "calib", "velodyne"):
