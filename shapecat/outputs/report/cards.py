@@ -51,9 +51,9 @@ def template(name: str) -> Template:
 
 
 class TrackCounts(NamedTuple):
-    """Counts of the tracks of a run, as their labels say; `cards.js` counts in the same way.
+    """Counts of the tracks of a run by their final labels; `cards.js` counts in the same way.
 
-    ``categories`` counts tracks, where merged tracks count as one. ``unsure`` is the number of
+    ``categories`` counts merged tracks as one and omits deleted ones. ``unsure`` is the number of
     uncertain tracks without a label, ``checked`` that of tracks with a label, both before merging.
     """
 
@@ -174,7 +174,7 @@ def _bar(name: str, share: float, digit: str) -> str:
 def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
     """Return an SVG plot of the causal posterior, with the times of detection below it.
 
-    It is empty if the recording has a single frame.
+    It is empty if ``end`` is 0, as for a single frame.
     """
     if end <= 0:
         return ""

@@ -83,7 +83,7 @@ class FramePicture(Record):
 
 
 class Crop(NamedTuple):
-    """A picture of an object as a data URI, its size in pixels, and its outline as SVG path."""
+    """A picture of an object: data URI, size in pixels, and the outline as SVG path data."""
 
     image: str
     width: int

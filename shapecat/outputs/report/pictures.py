@@ -119,7 +119,7 @@ def take_pictures(finished: FinishedRun, rows: Sequence[TrackRow], choice: Choic
     """Read the frames of a choice again and make the pictures.
 
     If the recording cannot be read, tracks get only drawings of their meshes, and there is no
-    overview strip. ``rows`` are the original rows of tracks.csv.
+    overview strip. ``rows`` are those of tracks.csv; their corrections are not used.
     """
     collector = _Collector(choice)
     advice = "run `shapecat annotate` with --recording PATH first"
@@ -139,7 +139,7 @@ def take_pictures(finished: FinishedRun, rows: Sequence[TrackRow], choice: Choic
 def _frames(
     finished: FinishedRun, rows: Sequence[TrackRow], choice: Choice
 ) -> Iterator[LabelledFrame]:
-    """Yield the frames of a choice; tracks have their original labels, those in ``rows``."""
+    """Yield the frames of a choice; tracks have the category in ``rows``, without corrections."""
     labels = {row.track: TrackLabel(row.track, row.category, row.confidence) for row in rows}
     left = set(choice.frames)
     for labelled in read_labelled_frames(finished.folder, labels):

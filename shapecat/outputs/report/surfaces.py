@@ -84,7 +84,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[SurfaceDrawing, 
 
 
 def recoloured(picture: str, colour: tuple[int, int, int]) -> str:
-    """Return a picture of `draw` in another colour."""
+    """Return the ``image`` of a `SurfaceDrawing` in another colour (red, green, blue)."""
     return _uri(with_palette(base64.b64decode(picture.partition(",")[2]), _palette(colour)[0]))
 
 
@@ -154,7 +154,7 @@ def _nearest(spots: F8) -> F8:
 
 
 def _closed(heights: F8) -> F8:
-    """Fill empty pixels of ``heights`` (h, w) that are mostly surrounded by the object."""
+    """Return ``heights`` (h, w) with the empty pixels filled that the object mostly surrounds."""
     for _ in range(_PASSES):
         solid = np.isfinite(heights)
         share = _blurred(solid.astype(np.float64))
@@ -179,7 +179,10 @@ def _blurred(image: F8) -> F8:
 
 
 def _palette(colour: tuple[int, int, int]) -> tuple[U1, U2]:
-    """Return a palette (k, 3) and its opacity: a transparent entry, then shades, darkest first."""
+    """Return a palette (k, 3), and the opacity (1,) of its first entry, which is transparent.
+
+    The other entries are shades of ``colour``, the darkest first.
+    """
     light = np.linspace(0, 1, _SHADES)
     shades = [
         np.interp(light, (0, 0.75, 1), (0.32 * part, part, part + 0.45 * (255 - part)))

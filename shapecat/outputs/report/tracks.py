@@ -49,7 +49,7 @@ def read_timelines(folder: Path) -> dict[int, Timeline]:
     names, starts = np.unique(tracks[order], return_index=True)
     for track, rows in zip(names.tolist(), np.split(order, starts[1:]), strict=False):
         keys = tuple((topics[k], frames[k], int(detections[k])) for k in rows.tolist())
-        seen, fused = detections[rows] >= 0, causal[rows.max()]  # a track's rows are as recorded
+        seen, fused = detections[rows] >= 0, causal[rows.max()]  # the last row recorded
         timelines[track] = Timeline(seconds[rows], seen, causal[rows], keys, fused)
     return timelines
 

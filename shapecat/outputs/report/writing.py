@@ -91,7 +91,7 @@ class RunReport:
 
         Raises
         ------
-        OutputError : the tracks.csv of the run is invalid.
+        OutputError : the tracks.csv of the run is invalid, or the run is gone.
         """
         finished, cards = read_finished(self.folder), self._cards(self._table)
         return Listed(
@@ -105,7 +105,7 @@ class RunReport:
 
     @property
     def _notes(self) -> list[str]:
-        """Warnings about the page, beside those of the run."""
+        """Warnings about the page, in addition to those of the run."""
         reason = self.pictures.reason
         return [f"surfaces are drawn from their meshes, without points: {reason}"] if reason else []
 
@@ -195,7 +195,7 @@ def read_reports(folders: Sequence[Path], observe: Observer = ignore) -> Reports
 
     Parameters
     ----------
-    folders : runs, or folders of runs. There is no index if they hold a single run.
+    folders : runs, or folders of runs. There is no index if the only folder is a run.
     observe : called with the phase, the number of runs read, and the total.
 
     Raises
@@ -267,9 +267,9 @@ def _link(start: Path, target: Path) -> str:
 
 
 def _faces(cards: Sequence[Card], labels: Mapping[int, TrackLabel]) -> tuple[str, ...]:
-    """Return pictures of the most certain object of each category, then of other objects.
+    """Return pictures, data URIs, of the most certain object of each category, then of others.
 
-    ``labels`` are the final labels. Of merged tracks, the one that gives the number is preferred.
+    ``labels`` are the final labels. Of merged tracks, the one that keeps its number is preferred.
     """
     pictures: dict[TrackLabel, str] = {}
     shown = [card for card in cards if card.pictures and card.row.track in labels]
