@@ -153,7 +153,7 @@ class _Pending(Generic[_Item, _Result]):
 
 
 def _drop_finished(item: list[_Item], future: Future[_Result]) -> None:
-    """Drop the item of a future that has a result."""
+    """Empty ``item``, the list that holds the item of ``future``, if there is a result."""
     if not future.cancelled() and future.exception() is None:
         item.clear()
 

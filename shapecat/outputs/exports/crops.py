@@ -69,9 +69,9 @@ class Origin(NamedTuple):
 def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
     """Add the views of a run to a data set; return their number.
 
-    Earlier views of the same topics of the recording are replaced if their time range is included,
-    even if their run had another name. No view then has an outdated label or occurs twice. Deleted
-    tracks are left out; ``unknown`` is a category like any other.
+    Earlier views of the same topics of the recording are replaced if the run covers their time
+    range, even if their run had another name. No view then has an outdated label or occurs twice.
+    Deleted tracks are left out; ``unknown`` is a category like any other.
 
     Raises
     ------

@@ -272,7 +272,7 @@ def _made_by_export(folder: Path) -> Collection[str] | None:
 
 
 def _tracked(frames: Iterable[LabelledFrame], placed: Collection[str]) -> Iterator[LabelledFrame]:
-    """Leave out frames without a pose if their topic is tracked in the fixed frame (``placed``)."""
+    """Leave out frames without a pose on ``placed``, the topics tracked in the fixed frame."""
     return (f for f in frames if f.fixed_from_sensor is not None or f.topic not in placed)
 
 

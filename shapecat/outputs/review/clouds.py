@@ -23,7 +23,7 @@ _PLANE_M = 0.015  # largest distance of points from the plane that they belong t
 class PaintedCloud(Record):
     """Points (n, 3), metres, sensor frame, with colours (n,) packed as 0xRRGGBBAA.
 
-    Drawn with ``radius_m``, they nearly close the surface.
+    Drawn with radius ``radius_m``, metres, neighbouring points nearly touch.
     """
 
     points: F4 = array("n 3", "f4")

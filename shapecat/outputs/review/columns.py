@@ -53,6 +53,7 @@ class Columns:
         Parameters
         ----------
         at : stamp (ns) and number of the frame.
+        row : what ``drawing`` converts to columns.
         drawing : the same for all rows of this entity.
         size : number of values that the row keeps in memory.
         """
