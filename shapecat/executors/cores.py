@@ -11,7 +11,7 @@ THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "
 
 
 def usable_cores() -> int:
-    """Return the number of cores this process may use, limited by taskset, Slurm or a container."""
+    """Return the number of cores this process may use, limited by taskset, Slurm or a cpuset."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return cores or 1
 

@@ -147,7 +147,7 @@ def _receive(connection: socket.socket) -> Any:
 
 
 def _read(connection: socket.socket, size: int) -> bytearray:
-    """Read `size` bytes, usually in one call, which waits without the interpreter lock."""
+    """Read ``size`` bytes, usually in one call, which waits without the interpreter lock."""
     content = bytearray(size)
     rest = memoryview(content)
     while rest:

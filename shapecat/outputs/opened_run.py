@@ -77,14 +77,14 @@ class Table:
             raise OutputError(msg) from error
 
     def pandas(self, columns: str | Iterable[str] | None = None) -> Any:
-        """Read the table, or some columns, as a pandas data frame; pandas must be installed."""
+        """Read the table, or some columns, as a pandas data frame; as `arrow`, but needs pandas."""
         return self.arrow(columns).to_pandas()
 
     def numpy(self, column: str) -> Any:
         """Read a column as an array: (n,) for numbers or text, (n, k) for lists of equal length.
 
         Lists of different lengths become an object array of arrays. Null becomes NaN, or a row of
-        NaN.
+        NaN. Errors are those of `arrow`.
         """
         chunks = self.arrow([column])[column]
         if pa.types.is_fixed_size_list(chunks.type):

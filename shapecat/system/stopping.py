@@ -34,7 +34,7 @@ class Stopped(KeyboardInterrupt):
     """A signal stopped the work; finished parts are kept."""
 
     def __init__(self, signum: int = signal.SIGINT) -> None:
-        """Set the exit code of the signal."""
+        """Set ``exit_code``, as a shell would for this signal."""
         super().__init__(signum)
         self.exit_code = 128 + signum
 
