@@ -31,7 +31,7 @@ _LOST = {
     *("WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"),  # Ray
 }
 _DROPPED = {"CancelledError", "FutureCancelledError", "CommClosedError"}
-"""Names of errors, since neither Dask nor Ray has to be installed."""
+"""Errors that mean a lost worker, and a lost scheduler, by name: Dask and Ray may be missing."""
 
 
 def open_executor(name: str, *, workers: int, address: str | None = None) -> WorkerExecutor:

@@ -13,7 +13,7 @@ class WorkerExecutor(Executor):
     """An executor as in `concurrent.futures`, which can also be ended early.
 
     A ``with`` block ends by waiting for the tasks. If `Stopped` ends the block, the tasks may save
-    their results and stop; another error ends them.
+    their results and stop; any other error ends the workers at once.
     """
 
     def __exit__(

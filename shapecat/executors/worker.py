@@ -31,7 +31,7 @@ class WorkerLostError(RuntimeError):
 
 
 class Call(NamedTuple):
-    """A call, and the future of its result."""
+    """A call (function, arguments, keyword arguments), and the future of its result."""
 
     future: Future[Any]
     call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]

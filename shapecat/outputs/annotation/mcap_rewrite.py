@@ -117,7 +117,7 @@ class _Target:
 
 
 def _copy_extras(recording: McapRecording, writer: Writer) -> None:
-    """Copy attachments and metadata to the writer; warn of those that are damaged."""
+    """Copy attachments and metadata to the writer; warn about damaged ones."""
     for record in recording.top_level():
         try:
             if record.opcode == Opcode.ATTACHMENT:

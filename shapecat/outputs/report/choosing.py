@@ -71,7 +71,10 @@ def choose_frames(folder: Path, timelines: Mapping[int, Timeline]) -> Choice:
 
 
 def _views(folder: Path, owner: Mapping[Detected, int]) -> dict[int, list[_View]]:
-    """Return the views of each track in table order, rated by size and completeness."""
+    """Return the views of each track in table order, rated by size and completeness.
+
+    ``owner`` is the track of each detection.
+    """
     columns = ["topic", "frame", "detection", "points", "touches_border", "occluded"]
     masks = _areas(read_masks(folder))
     views: dict[int, list[_View]] = {}
@@ -120,7 +123,8 @@ def _strip(
 
     It is the frame with the most tracks that no earlier frame of the strip shows. Among equal
     frames, it is the one with the most tracks, then the one nearest to the middle of the part.
-    ``stamps`` are the stamp (ns) and the key of each frame, sorted by time.
+    ``stamps`` are the stamp (ns) and the key of each frame, sorted by time; ``tracks_of`` are the
+    tracks detected in each frame.
     """
     covered: set[tuple[str, int]] = set()
     strip = {}

@@ -41,7 +41,10 @@ def _file_of(image: ColourImage) -> tuple[bytes, str]:
 
 
 def layer_of(visible: Sequence[tuple[LabelledObject, Mask]], height: int, width: int) -> bytes:
-    """Return masks as a translucent PNG; Rerun would not compress a segmentation image."""
+    """Return the masks on an image of this size, in pixels, as a translucent PNG.
+
+    Rerun would not compress a segmentation image.
+    """
     categories = list(dict.fromkeys(item.category for item, _ in visible))
     layer = np.zeros((height, width), np.uint8)
     for item, mask in visible:
