@@ -300,10 +300,28 @@ def test_cores_are_shared_between_recordings_and_their_frames(
 
 def test_only_cores_of_this_job_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """In a Slurm job with 3 of 64 cores, 64 processes would fill its memory."""
+    monkeypatch.setattr("shapecat.executors.cores._QUOTA", Path("no quota"))
     monkeypatch.setattr("os.cpu_count", lambda: 64)
     monkeypatch.setattr("os.sched_getaffinity", lambda _: {2, 5, 11}, raising=False)
 
     assert usable_cores() == 3
+
+
+@pytest.mark.parametrize(
+    ("quota", "cores"),
+    [("250000 100000", 3), ("50000 100000", 1), ("max 100000", 64), (None, 64)],
+)
+def test_quota_of_container_limits_cores(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quota: str | None, cores: int
+) -> None:
+    """`docker run --cpus 2.5` leaves all 64 cores visible: 64 processes would share its quota."""
+    file = tmp_path / "cpu.max"
+    if quota is not None:
+        file.write_text(f"{quota}\n")
+    monkeypatch.setattr("shapecat.executors.cores._QUOTA", file)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(64)), raising=False)
+
+    assert usable_cores() == cores
 
 
 def test_missing_or_invalid_executors_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -678,6 +678,23 @@ def test_screenshot_ends_viewer_process(tmp_path: Path, monkeypatch: pytest.Monk
     assert not alive(pid)
 
 
+def test_silent_viewer_ends_command_with_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A viewer that hangs would end ``view --web`` with a traceback."""
+    fake = tmp_path / "rerun"
+    fake.write_text("#!/bin/sh\nexec sleep 60\n")
+    fake.chmod(0o755)
+    monkeypatch.setattr(review_viewer, "_viewer", lambda: str(fake))
+    monkeypatch.setattr(review_viewer, "_LOAD_S", 0.2)
+
+    with (
+        pytest.raises(OutputError, match="the viewer gave no answer"),
+        review_viewer.serve_viewer(fake),
+    ):
+        pytest.fail("it is not served")
+
+
 def test_slow_screenshot_is_tried_again(tmp_path: Path) -> None:
     """Rerun waits 15 s for a picture; a loaded machine needs longer."""
     answers = [TimeoutError("Deadline expired"), TimeoutError("Deadline expired"), None]

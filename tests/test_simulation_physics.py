@@ -52,6 +52,13 @@ def table(height: float = 0.7) -> Mesh:
     return Mesh(slab.vertices + np.array([0, 0, height - 0.03]), slab.triangles)
 
 
+def test_falling_objects_are_not_supported_by_one_another() -> None:
+    """Without a contact, the truth would name the first object, even for itself."""
+    drops = [Drop(make_box(np.random.default_rng(k)), np.eye(3), np.array([k, 0])) for k in (0, 1)]
+
+    assert [pose.supported_by for pose in settle([], drops)] == [None, None]
+
+
 def test_only_open_shapes_are_divided_into_convex_parts() -> None:
     """The convex hull of a cup is solid, and nothing could lie in it."""
     for seed in range(3):

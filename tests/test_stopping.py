@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import count
@@ -238,6 +239,21 @@ def test_message_of_a_failed_part_does_not_outlive_it(capfd: pytest.CaptureFixtu
     with stopping.handling_signals():
         signal.raise_signal(signal.SIGINT)
     assert "after the frames in progress" in capfd.readouterr().err
+
+
+def test_command_in_another_thread_keeps_a_stop_request() -> None:
+    """If it forgot the request when it ends, the main thread would go on for hours."""
+
+    def command() -> None:
+        with stopping.handling_signals():
+            pass
+
+    with stopping.handling_signals():
+        stopping.request()
+        other = threading.Thread(target=command)
+        other.start()
+        other.join()
+        assert stopping.asked()
 
 
 @pytest.fixture

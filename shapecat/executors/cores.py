@@ -1,8 +1,10 @@
 """Count and share the cores, and limit the threads of numeric libraries."""
 
+import math
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 __all__ = ["THREAD_LIMITS", "share_cores", "single_threaded", "usable_cores"]
 
@@ -10,10 +12,21 @@ THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "
 """Environment variables that numeric libraries read when they are loaded."""
 
 
+_QUOTA = Path("/sys/fs/cgroup/cpu.max")
+"""CPU time that a container may use in each period, and the period, microseconds."""
+
+
 def usable_cores() -> int:
-    """Return the number of cores this process may use, limited by taskset, Slurm or a cpuset."""
+    """Return the number of cores this process may use.
+
+    It is limited by taskset, Slurm or a cpuset, and by the CPU quota of a container.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return cores or 1
+    cores = cores or 1
+    with suppress(OSError, ValueError):  # no such file; "max": no quota
+        quota, period = map(int, _QUOTA.read_text().split())
+        cores = min(cores, math.ceil(quota / period))
+    return max(cores, 1)
 
 
 def share_cores(jobs: int | None, recordings: int) -> tuple[int, int]:

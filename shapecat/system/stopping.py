@@ -91,12 +91,13 @@ def handling_signals() -> Iterator[None]:
     """Store SIGINT and SIGTERM during the block instead of raising; forget them at its end.
 
     Ignored signals, such as SIGINT in a background job, stay ignored. Outside the main thread,
-    which alone may handle signals, the handlers do not change.
+    which alone may handle signals, nothing changes.
     """
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        handlers = {signum: signal.getsignal(signum) for signum in _SIGNALS}
-        before = {n: h for n, h in handlers.items() if h not in {None, signal.SIG_IGN}}
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handlers = {signum: signal.getsignal(signum) for signum in _SIGNALS}
+    before = {n: h for n, h in handlers.items() if h not in {None, signal.SIG_IGN}}
     for signum in before:
         signal.signal(signum, _handle)
     try:

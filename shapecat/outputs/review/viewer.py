@@ -187,8 +187,7 @@ def _wait_for(viewer: subprocess.Popen[bytes], port: int, log: IO[bytes]) -> Non
 
     Raises
     ------
-    OutputError : the viewer has ended; the text says why.
-    TimeoutError : the viewer does not answer.
+    OutputError : the viewer has ended, and the text says why; or it does not answer.
     """
 
     def answers() -> bool:
@@ -197,7 +196,11 @@ def _wait_for(viewer: subprocess.Popen[bytes], port: int, log: IO[bytes]) -> Non
         with socket.socket() as probe:
             return probe.connect_ex((_HERE, port)) == 0
 
-    _wait_until(answers)
+    try:
+        _wait_until(answers)
+    except TimeoutError as error:
+        msg = f"the viewer gave {error}"
+        raise OutputError(msg) from error
 
 
 def _has_ended(viewer: subprocess.Popen[bytes]) -> bool:

@@ -177,6 +177,7 @@ def _settled_poses(mujoco: Any, model: Any, data: Any, count: int) -> list[Settl
             if body >= 0:
                 upward_force[body, other] += up
     supporting = upward_force.argmax(axis=1)
+    supporting[upward_force.max(axis=1) <= 0] = count  # still in the air
     return [
         SettledPose(_pose(data, k), None if supporting[k] == count else int(supporting[k]))
         for k in range(count)
