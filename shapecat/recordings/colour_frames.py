@@ -40,8 +40,7 @@ image, and cameras give up to 60 images per second."""
 _BUFFERED_BYTES = 96 << 20
 """Maximum total size of the kept images, bytes; two images are kept in any case."""
 _STAMP_BYTES = 12
-"""Length of the start of a ROS message, which holds its stamp, bytes. Calibrations are compared
-without it."""
+"""Bytes of a ROS message up to the end of its stamp. Calibrations are compared without these."""
 _PATIENCE_NS = 500_000_000
 """Maximum log time that a frame waits for a colour image, nanoseconds."""
 _USUAL_PERIOD_NS = 100_000_000
@@ -136,7 +135,7 @@ def _paired(frame: Frame, partners: Mapping[str, "_Partner"]) -> tuple[Frame, Co
 
 
 class _BufferedImage(NamedTuple):
-    """A decoded image message, and how many times the clock had been set back before it."""
+    """A decoded image message, its size, and how often the clock had been set back before it."""
 
     stamp_ns: int
     log_time_ns: int

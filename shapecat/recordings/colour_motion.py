@@ -16,7 +16,7 @@ from shapecat.types import Frame, Pose
 __all__ = ["view_at_its_time"]
 
 _LEAST_PX = 0.5
-"""Smaller motions are ignored: those of a camera at rest whose pose is measured."""
+"""Smaller motions are ignored, since the measured pose of a camera varies even at rest."""
 _NEAR_M = 1.0
 """Distance from the camera, metres, at which a motion is expressed in pixels."""
 
@@ -55,7 +55,7 @@ def view_at_its_time(
     buffer = transforms().around(frame.log_time_ns, start_ns)
 
     def motion_of(frame_id: str) -> Pose:
-        """Return the pose of a frame at the first stamp in the same frame at the second."""
+        """Return the pose of a frame at the first stamp relative to itself at the second."""
         start, end = (buffer.lookup(fixed_frame, frame_id, ns) for ns in (start_ns, end_ns))
         return compose(inverse(end), start)
 

@@ -264,7 +264,7 @@ def _compressed_encoding(first: Any) -> str:
     begin = bytes(first.data[:26])
     kind = compressed_kind(begin)
     pixels = str(first.format).split(";")[0].strip()
-    # Packed like colour, such as "16UC1; png compressed", or just "png" in Foxglove.
+    # Depth may be compressed like colour: "16UC1; png compressed", or just "png" in Foxglove.
     if pixels in DEPTH_ENCODINGS or is_grey_png16(begin):
         return ""
     return "mono8" if kind and pixels == "mono8" else kind

@@ -111,7 +111,7 @@ def frames(
     topics = {*sources, *infos, *callbacks}
     start_ns, end_ns = frame_range.limits_ns(recording.start_ns)
     for message in recording.messages(topics, start_ns, end_ns, is_needed):
-        # Messages that are not needed have no data, and neither have those that damage destroyed.
+        # A message has no data if it is not needed, or if it is damaged.
         unread = not message.data and not is_needed(message.topic, message.log_time_ns)
         if message.topic in callbacks and message.data:
             callbacks[message.topic](message)

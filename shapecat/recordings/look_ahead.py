@@ -17,7 +17,7 @@ its stamp, and publish transforms more often than this."""
 
 
 def is_read_at_once(recording: Recording) -> bool:
-    """Return whether a recording is read at once, since it is short or has no index."""
+    """Return whether to read all messages at the start: the recording is short or has no index."""
     return recording.end_ns - recording.start_ns <= 2 * AROUND_NS or not recording.indexed
 
 

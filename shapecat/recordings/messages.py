@@ -35,7 +35,7 @@ None if all data is needed."""
 _SMALL = 1 << 16  # bytes
 
 MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
-"""Errors raised when a decoded message is used that lacks fields or has values of wrong types."""
+"""Errors raised by the use of a message that lacks fields or has values of wrong types."""
 
 
 class MessageError(RecordingError):

@@ -31,7 +31,7 @@ class Recording(ABC):
     start_ns, end_ns : log times of the first and last message; 0 if there is none.
     closed : whether the recording was closed; then no messages can be read.
     indexed : whether messages can be found by topic and time, without reading the whole file.
-    damaged : whether a damaged chunk, or a damaged index of one, was found in an MCAP file so far.
+    damaged : whether a damaged chunk or message index was found so far; set for MCAP files only.
     warnings : problems found in the recording, for the user.
     frame_ids : frame ids found so far, by topic: a cache for the search for streams.
     """
@@ -75,8 +75,8 @@ class Recording(ABC):
         topics : names to read; all by default.
         start_ns, stop_ns : messages with ``start_ns <= log time < stop_ns`` are read.
         needed : returns whether the data of a message is needed. Messages that are not needed may
-            be yielded without data. If ``needed`` is given, destroyed messages are yielded without
-            data, too, so that frame numbers do not depend on which messages are needed.
+            be yielded without data. If ``needed`` is given, damaged messages, too, are yielded
+            without data, so that frame numbers do not depend on which messages are needed.
 
         Yields
         ------
@@ -126,7 +126,7 @@ class Recording(ABC):
         return decode(message, self._decoders)
 
     def warn(self, text: str) -> None:
-        """Add a warning for the user, unless it repeats one or there are 100 already."""
+        """Add a warning unless it is a duplicate; after 100, only note that there are more."""
         if text not in self.warnings and len(self.warnings) <= _MOST_WARNINGS:
             enough = len(self.warnings) == _MOST_WARNINGS
             self.warnings.append("and more warnings" if enough else text)

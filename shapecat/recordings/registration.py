@@ -42,7 +42,7 @@ def is_straight(lens: LensCamera, camera: Camera | None) -> bool:
 
 
 def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> bool:
-    """Return whether the intrinsics differ by less than ``fraction`` of the image width, pixels."""
+    """Return whether the intrinsics differ by less than ``fraction`` of the image width."""
     if camera is None:
         return False
     intrinsics, camera_intrinsics = ((c.fx, c.fy, c.cx, c.cy) for c in (lens.pinhole, camera))
@@ -52,7 +52,7 @@ def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> boo
 
 @lru_cache(maxsize=8)
 def _bend_px(lens: LensCamera, camera: Camera | None) -> float:
-    """Return the largest distance (px) by which the lens moves a pixel of a pinhole camera."""
+    """Return by how many pixels, in x or y, the lens moves a pixel of ``camera`` at most."""
     if camera is None or not lens.model:
         return 0.0
     pinhole = lens.pinhole

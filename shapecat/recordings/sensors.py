@@ -51,7 +51,7 @@ class _Place(NamedTuple):
     ----------
     space : the namespace of the sensor.
     rest : the components after it.
-    camera : words in these that tell cameras apart.
+    camera : words in ``rest``, except in its last component, that tell cameras apart.
     """
 
     space: tuple[str, ...]

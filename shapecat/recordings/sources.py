@@ -107,7 +107,7 @@ class PointsSource(FrameSource):
         return unorganized(points) if content is None else content
 
     def _depth_image(self, points: F4) -> dict[str, Any] | None:
-        """Return the depth image of an organized cloud; None if no camera fits.
+        """Return `Frame` fields of an organized cloud: depth, camera, pose; None if no camera fits.
 
         The camera of earlier frames is kept if it still fits.
         """

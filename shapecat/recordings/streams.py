@@ -42,7 +42,7 @@ _OTHER_WORDS = (
     *("amplitude", "confidence", "disparity", "intensity", "mask", "snr", "statemap", "texture"),
     "thermal",
 )
-"""Images on topics with these words are not depth images, even if they are encoded like these."""
+"""Images on topics with these words are not depth images, even if the encoding is one of depth."""
 _AXES = {"x", "y", "z"}
 
 
@@ -155,7 +155,7 @@ def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
 
 
 def _encoding_or_error(recording: Recording, topic: Topic) -> str:
-    """Return the encoding of a topic's images, or why none of its messages can be decoded."""
+    """Return the encoding of a topic's images, or why none can be decoded; empty for others."""
     if ros_counterpart(topic.type) not in _PROBES:
         return ""
     reason = ""
@@ -186,7 +186,7 @@ def _rank(stream: Stream) -> tuple[bool, bool, bool, bool, int, str]:
 
 
 def _image_name(topic: str) -> str:
-    """Return a topic in lower case, without the transport that compresses its images."""
+    """Return a topic in lower case, without the suffix ``/compressedDepth``."""
     return topic.lower().removesuffix("/compresseddepth")
 
 
@@ -308,7 +308,7 @@ def _nearest(image: str, infos: Sequence[str]) -> str | None:
     parts = image.split("/")
     outermost = 2 if image.startswith("/") else 1  # the first part of /depth/image is empty
     for length in range(len(parts), min(len(parts) - 1, outermost) - 1, -1):
-        suffix = re.sub("[^/]*_to_", "", "/".join(parts[length:]))  # depth_to_color is as color
+        suffix = re.sub("[^/]*_to_", "", "/".join(parts[length:]))  # depth_to_color means color
         own_names = (f"{word}_camera_info" for word in re.split("[/_]", suffix))
         for name in (*own_names, *_INFO_NAMES):
             if (sibling := "/".join([*parts[:length], name])) in infos:

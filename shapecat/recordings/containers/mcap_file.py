@@ -155,7 +155,7 @@ class McapRecording(ChunkedRecording):
                 yield error.record
 
     def _expand(self, record: Record | None) -> Iterator[RawMessage]:
-        """Yield the messages of a top-level record; store its schemas and channels."""
+        """Yield the messages of a top-level record; store its channels if there is no index."""
         if record is None:
             return
         if record.opcode == Opcode.CHUNK:
@@ -167,7 +167,10 @@ class McapRecording(ChunkedRecording):
                 self.warn(f"skipped a record at byte {record.offset}: {error}")
 
     def _split(self, record: Record, end: int | None = None) -> Iterator[RawMessage]:
-        """Yield the messages of a chunk, up to its byte ``end`` or to where it is truncated."""
+        """Yield the messages in the first ``end`` decompressed bytes of a chunk; None for all.
+
+        Damage or truncation ends the messages, with one warning per chunk.
+        """
         try:
             for opcode, content in split_chunk(self._plain(record, end)):
                 yield from self._take(opcode, content)

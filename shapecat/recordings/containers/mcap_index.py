@@ -11,8 +11,9 @@ from shapecat.recordings.containers.mcap_records import TruncatedError, read_con
 __all__ = ["IndexedMessage", "read_message_index"]
 
 _HEAD = struct.Struct("<HI")
+"""Head of a message index: channel id, and size of all entries in bytes."""
 _ENTRY = struct.Struct("<QQ")
-"""Head of a message index: channel id and bytes of all entries. An entry: log time and offset."""
+"""Entry of a message index: log time, and offset of the message in the decompressed chunk."""
 
 
 class IndexedMessage(NamedTuple):

@@ -157,7 +157,7 @@ def read_chunk(content: bytes, *, end: int | None = None, checked: bool = False)
 def _decompress(
     method: Callable[[memoryview, int], bytes | memoryview], data: memoryview, size: int
 ) -> memoryview:
-    """Return ``data``, which has ``size`` bytes when decompressed, by a method of `_DECOMPRESS`.
+    """Decompress ``data`` to ``size`` bytes with a method of `_DECOMPRESS` or `_DECOMPRESS_PART`.
 
     Raises
     ------

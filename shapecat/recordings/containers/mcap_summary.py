@@ -89,7 +89,7 @@ def _checksum(file: BinaryIO, size: int, start: int) -> int:
 
 
 def _collect(file: BinaryIO, start: int, end: int) -> Summary:
-    """Read the schemas, channels and chunk indexes between two offsets in a file."""
+    """Read the records of the summary section, which extends from ``start`` to ``end`` (bytes)."""
     summary = Summary()
     for record in walk(file, start, end):
         content = read_content(file, record)
@@ -112,7 +112,12 @@ def _collect(file: BinaryIO, start: int, end: int) -> Summary:
 
 
 def _find_data_end(file: BinaryIO, summary: Summary, summary_start: int) -> int:
-    """Return the offset of the data end record; the search starts after the last indexed record."""
+    """Return the offset of the first data end record after the last indexed record.
+
+    Raises
+    ------
+    TruncatedError : there is none, or a record extends beyond ``summary_start``.
+    """
     ends = [c.chunk_start_offset + c.chunk_length for c in summary.chunks]
     ends += [item.offset + item.length for item in (*summary.attachments, *summary.metadata)]
     for record in walk(file, max(ends, default=len(MAGIC)), summary_start):

@@ -37,7 +37,7 @@ __all__ = ["BagRecording"]
 class BagRecording(ChunkedRecording):
     """A ROS 1 bag. The log time of a message is the time at which it was recorded.
 
-    Raises `RecordingError` if the file is not version 2.0, is encrypted, or holds no topics.
+    Raises `RecordingError` if it is not version 2.0, is encrypted, or has neither index nor topics.
     """
 
     kind: ClassVar[str] = "ros1"
@@ -68,7 +68,7 @@ class BagRecording(ChunkedRecording):
     def _read_index(self) -> bool:
         header = self._read_header()
         chunks: list[Chunk] = []
-        self._places: list[int] = []  # of the chunks in the index
+        self._places: list[int] = []  # offsets of the indexed chunks
         try:
             connections, number = u4(header, "conn_count"), u4(header, "chunk_count")
             position = u8(header, "index_pos")

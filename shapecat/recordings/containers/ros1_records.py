@@ -47,7 +47,7 @@ _RATIO = 1000
 class BagError(RecordingError):
     """A record is damaged, or extends beyond the end of the file or chunk.
 
-    ``record`` is a truncated record; None if its header is incomplete.
+    ``record`` is the readable part of a truncated record; None if its header is not readable.
     """
 
     def __init__(self, message: str, record: "Record | None" = None) -> None:

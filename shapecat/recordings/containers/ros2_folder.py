@@ -107,7 +107,7 @@ class FolderRecording(Recording):
         return chosen
 
     def _listed_names(self) -> set[str]:
-        """Return the file names under ``relative_file_paths`` of metadata.yaml.
+        """Return the file names under ``relative_file_paths`` of metadata.yaml, if it is readable.
 
         A regular expression is enough, since rosbag2 always writes the file in block style.
         """

@@ -96,7 +96,7 @@ def _read_rvl(data: bytes) -> U2:
 
 @kernel(inner=True)
 def _number(words: Any, at: int) -> tuple[int, int]:
-    """Read a number from the nibble `at`; return it and the index after it, -1 if the data ends."""
+    """Return the number at nibble `at`, and the index of the nibble after it, -1 if damaged."""
     value, shift = 0, 0
     while at < 8 * words.size and shift < 30:
         nibble = int(words[at // 8] >> np.uint32(28 - 4 * (at % 8))) & 15

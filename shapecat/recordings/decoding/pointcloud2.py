@@ -81,6 +81,6 @@ def unorganized(points: F4) -> dict[str, Any]:
     Points without depth become NaN. Drivers mark them with NaN, infinity or the origin.
     """
     flat = np.array(points.reshape(-1, 3), np.float32)
-    valid = np.isfinite(flat).all(1) & (flat != 0).any(1)  # any alone warns of signaling NaNs
+    valid = np.isfinite(flat).all(1) & (flat != 0).any(1)  # flat.any() warns of signaling NaNs
     flat[~valid] = np.nan
     return {"points": flat}

@@ -118,7 +118,7 @@ class TransformBuffer:
         fine = math.hypot(x, y, z) < _FARTHEST_M and 1e-6 < norm < math.inf
         if not (fine and parent and child and parent != child):
             return False
-        parent = sys.intern(parent)  # one for all samples
+        parent = sys.intern(parent)  # one string for all samples
         sample = TransformSample(parent, (x, y, z), tuple(part / norm for part in quaternion))
         if child not in self._tracks:
             self._tracks[child] = TransformTrack()
@@ -142,11 +142,11 @@ class TransformBuffer:
 
     @property
     def contradicted(self) -> list[str]:
-        """The frames whose transforms differ at the same stamps, as a clock was set back."""
+        """The frames whose transforms differ at the same stamps, because a clock was set back."""
         return sorted(name for name, track in self._tracks.items() if track.contradicted)
 
     def delays_between(self, target: str, source: str) -> list[Delays]:
-        """Return the delays of the transforms that move between two frames.
+        """Return the delays of each moving transform on the way between two frames.
 
         The list is empty if nothing moves, or the frames are not connected.
         """

@@ -13,7 +13,7 @@ _MOST = 1000
 
 
 class Delays:
-    """The delays of messages at moments that are spread evenly over those added so far."""
+    """Log time minus stamp of at most 1000 messages, spread evenly over those added so far."""
 
     def __init__(self) -> None:
         """Start without delays."""

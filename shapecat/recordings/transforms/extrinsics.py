@@ -53,11 +53,12 @@ class Extrinsics:
     ) -> Pose | None:
         """Return the pose ``colour_from_depth`` at the time of a depth image; None if unknown.
 
+        Depth images must come in the order of the recording, as only a little of the past is kept.
+
         Parameters
         ----------
         depth_frame, colour_frame : frame ids of the messages.
-        log_time_ns, stamp_ns : of the depth image, nanoseconds. Call this with the images in the
-            order of the recording.
+        log_time_ns, stamp_ns : of the depth image, nanoseconds.
         """
         if is_of_realsense_recorder(self._depth.topic):
             return self._realsense

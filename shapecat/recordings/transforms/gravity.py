@@ -20,7 +20,7 @@ from shapecat.types import Frame, Pose
 __all__ = ["MISNAMINGS", "Misnaming", "Orientation", "PoseFinder", "has_z_up", "turned"]
 
 _LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
-"""Frames whose z axis is up by convention (REP 105, REP 103), even after the name of a robot."""
+"""Frames whose z axis is up by convention (REP 105, REP 103). A robot's name may precede them."""
 _SOURCES = {"auto": ("tf", "imu"), "tf": ("tf",), "imu": ("imu",)}
 
 
@@ -80,12 +80,12 @@ class PoseFinder:
     Attributes
     ----------
     fixed_frame : name of the fixed frame; None until it is chosen at the first frame.
-    vector : (3,) the up direction in the sensor frame that the user gave; None if not given.
+    vector : (3,) the up direction given by the user, in the sensor frame; None if not given.
     sources : ``tf`` and ``imu``, in the order in which they are tried; empty if there is a vector.
     warnings : for the user.
     dropped : by topic, the source of an up direction that is ignored.
-    failed, first_failure : the number of failed look-ups, and the error of the first, other than in
-        gaps.
+    failed, first_failure : the number of look-ups that failed for other reasons than a gap, and the
+        error of the first.
     in_gaps, longest_gap : the number of frames without pose in gaps between transforms, and the
         longest gap.
     given : the number of frames by the source of their up direction.
@@ -311,9 +311,9 @@ def has_z_up(frame_id: str) -> bool:
 
 
 def _rank(name: str) -> int:
-    """Return the index in `_LEVEL_FRAMES` of a frame, without the robot's name.
+    """Return the index of a frame in `_LEVEL_FRAMES`, ignoring a robot's name before it.
 
-    Frames that are not listed come last.
+    For other frames, this is the number of frames listed there.
     """
     plain = name.rpartition("/")[2]
     return _LEVEL_FRAMES.index(plain) if plain in _LEVEL_FRAMES else len(_LEVEL_FRAMES)

@@ -28,16 +28,16 @@ _NEVER_NS = 2**63
 _GAP_NS = 500_000_000
 """Shorter intervals between two samples are no gaps: slow localization publishes as rarely."""
 _UNUSUAL = 3
-"""A gap is longer than this many of the other intervals, on average: a transform that is always
-published rarely has no gaps."""
+"""A gap is longer than this many times the mean of the other intervals, so that transforms at a low
+rate have no gaps."""
 _LONGEST_NS = 10_000_000_000
 """Longer intervals count as this long in the mean: what lies between may not have been read."""
 _SET_BACK_NS = 1_000_000_000
 """A clock was set back if a stamp is farther than this before an earlier one; late messages are
 nearer."""
 _MOVED_M = 0.02
-"""Samples that differ by less than this and `_TURNED` are close. Those around a gap are then
-interpolated: the frame was at rest, as in transforms that are published only on change, or
+"""Samples that differ by less than this and `_TURNED` are close. If the two around a gap are close,
+they are interpolated: the frame was at rest, as in transforms that are published only on change, or
 localization corrected it."""
 _TURNED = math.radians(1)
 
@@ -83,7 +83,8 @@ class TransformTrack:
     def gaps_ns(self, stamp: int) -> tuple[int, int]:
         """Return the time from the last sample to a stamp, and from the stamp to the first, ns.
 
-        A positive time means that the stamp is outside the samples; latched samples never end.
+        If a time is positive, the stamp is outside the samples, or there are none. Latched samples
+        never end.
         """
         if not self.stamps:
             return _NEVER_NS, _NEVER_NS
@@ -125,7 +126,7 @@ class TransformTrack:
             self._set(slice(at, at), stamp, sample)
 
     def note(self, log_time_ns: int, stamp_ns: int, sample: TransformSample) -> None:
-        """Take note of the log time of a sample; compare it with the first one."""
+        """Add the delay of a sample, and update ``moves``."""
         if self.delays.add(log_time_ns, stamp_ns) and not self.moves:
             self._first = self._first or sample
             self.moves = not are_close(self._first, sample)
@@ -137,7 +138,10 @@ class TransformTrack:
             del self.stamps[:first], self._parents[:first], self._numbers[: 7 * first]
 
     def _differs(self, at: int, stamp: int, sample: TransformSample) -> bool:
-        """Return whether samples near a stamp, of which number ``at`` is next, differ from one."""
+        """Return whether a sample differs from its neighbours, numbers ``at - 1`` and ``at``.
+
+        The result is False if these are not near in time.
+        """
         near = at > 0 and (self.stamps[at - 1] == stamp or self.stamps[at] - stamp <= _GAP_NS)
         return near and not any(are_close(self[k], sample) for k in (at - 1, at))
 

@@ -44,7 +44,7 @@ def is_latched(kind: str) -> bool:
 def _of_other_robots(
     recording: Recording, spaces: Mapping[str, str], sensor_topics: Sequence[str]
 ) -> set[str]:
-    """Return the topics of other robots, given the namespace of each topic."""
+    """Return the topics of other robots, and add warnings; ``spaces`` maps topics to namespaces."""
     around = {
         max(
             (s for s in spaces.values() if name.strip("/").startswith(f"{s}/")), key=len, default=""

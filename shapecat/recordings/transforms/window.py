@@ -13,7 +13,7 @@ from shapecat.recordings.transforms.topics import is_latched, transform_topics
 __all__ = ["TransformWindow"]
 
 _LAG_NS = AROUND_NS // 2
-"""If stamp and log time of a transform differ by more than this, all are read at once."""
+"""If stamp and log time of a transform differ by more than this, all are read at the start."""
 _NEAR_NS = 1_000_000_000
 """Before the first frame, transforms at most this far from the middle of the recording are read."""
 
@@ -65,16 +65,16 @@ class TransformWindow:
 
     @property
     def moves(self) -> bool:
-        """Whether any frame moves, by the transforms so far."""
+        """Whether any frame moves in the transforms read so far."""
         return self._known.moves
 
     @property
     def contradicted(self) -> list[str]:
-        """The frames whose transforms so far differ at the same stamps; see the buffer's."""
+        """`TransformBuffer.contradicted` for the transforms read so far."""
         return self._known.contradicted
 
     def delays_between(self, target: str, source: str) -> list[Delays]:
-        """Return the delays of the transforms that move between two frames; see the buffer's."""
+        """Return `TransformBuffer.delays_between` for the transforms read so far."""
         return self._known.delays_between(target, source)
 
     def around(self, log_time_ns: int, stamp_ns: int) -> TransformBuffer:
