@@ -18,6 +18,7 @@ class LensCamera:
 
     Attributes
     ----------
+    pinhole : the camera without distortion.
     model : one of `shapecat.cameras.lenses.LENS_MODELS`, or empty without distortion.
     coefficients : the distortion coefficients, in OpenCV's order.
     """

@@ -18,7 +18,7 @@ LENS_MODELS = ("plumb_bob", "rational_polynomial", *FISHEYE_MODELS)
 """The supported lens models of OpenCV's calibration."""
 
 _ROUNDS = 30
-"""Maximum number of iterations; lenses of 120 degrees need as many near their edge."""
+"""Maximum number of iterations; lenses of 120 degrees need this many near their edge."""
 _ENOUGH_PX = 1e-4
 """Error at which the iterations end."""
 _WRONG_PX = 0.1

@@ -212,9 +212,10 @@ def _fill(labels: I4, region: tuple[int, int, int, int], narrow: int, wide: int)
 def _surrounding(label: int, w: int, e: int, n: int, s: int, narrow: int, wide: int) -> int:
     """Return the object that surrounds a pixel of label 0 or -1; the label itself if none does.
 
-    ``w``, ``e``, ``n`` and ``s`` are from `_step`, for the four directions. A gap between two sides
-    of an object is at most ``narrow`` pixels; up to ``wide`` pixels, an object must be seen in
-    three directions.
+    ``w``, ``e``, ``n`` and ``s`` are from `_step`, for the four directions. An object surrounds a
+    pixel of label 0 if the gap at the pixel is at most ``narrow`` pixels along both axes. For label
+    -1, one axis is enough, or the object on three sides within ``wide`` pixels, with no label 0 in
+    between.
     """
     across = w >> 16 if w >> 16 == e >> 16 and _gap(w) + _gap(e) <= narrow + 1 else 0
     along = n >> 16 if n >> 16 == s >> 16 and _gap(n) + _gap(s) <= narrow + 1 else 0

@@ -61,7 +61,7 @@ def _area(ring: I4) -> float:
 
 
 def _simplified(ring: F8) -> F8:
-    """Drop the corners (n, 2) of a closed line that hardly stick out (Douglas and Peucker 1973)."""
+    """Drop those corners of a ring (n, 2) that hardly stick out (Douglas and Peucker 1973)."""
     farthest = int(((ring - ring[0]) ** 2).sum(axis=1).argmax())
     closed = np.concatenate([ring, ring[:1]])
     keep = np.zeros(len(closed), np.bool_)

@@ -266,10 +266,10 @@ def _nearest_surface(around: F4, corner: tuple[int, int], cell: int, shape: tupl
 
 @kernel(inner=True)
 def _hide(front: F4, cell: int, boxes: I4, nearest: F4, splat: I4) -> None:
-    """Set the labels in boxes to 0 where another surface hides them.
+    """Set pixels in boxes to label 0 where another surface hides their object, or they have none.
 
-    ``front`` is from `_nearest_surface`, with its ``cell``; ``splat`` (h, w) holds the labels;
-    ``nearest`` (h, w) is the inverse depth of the labels.
+    ``boxes`` are as in `splat_depth`; ``front`` is from `_nearest_surface`, with its ``cell``;
+    ``splat`` (h, w) holds the labels, ``nearest`` (h, w) their inverse depth, 0 without a label.
     """
     limit, share = np.zeros(splat.shape[1], np.float32), np.float32(1 - _HIDDEN)
     for k in range(boxes.shape[0]):
