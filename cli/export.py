@@ -178,7 +178,7 @@ def _export_dataset(
     recording: Path | None,
     chosen: dict[str, Any],
 ) -> None:
-    """Export several runs as one data set."""
+    """Export runs as one data set; ``chosen`` are the fields of `ImageSelection`."""
     from shapecat.outputs.exports.dataset_frames import ImageSelection
     from shapecat.outputs.exports.formats import export_dataset
 

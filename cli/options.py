@@ -21,12 +21,12 @@ class _NonEmptyPath(click.Path):
             self.fail("the path is empty", param, ctx)
         of_home = isinstance(value, str) and value.partition("/")[0] == "~"
         if of_home:
-            value = os.path.expanduser(value)  # noqa: PTH111  the other raises without a home
+            value = os.path.expanduser(value)  # noqa: PTH111  Path's raises without a home
         return super().convert(value, param, ctx)
 
 
 class _LocalPath(_NonEmptyPath):
-    """A path on this machine; refuses URLs, which would lose a slash and name a local folder."""
+    """A path on this machine. URLs are refused: they would lose a slash and name a local folder."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         from shapecat.batch.storage import is_url
@@ -125,7 +125,7 @@ def choice_option(
 
 
 def boxes_option(where: str) -> Any:
-    """Return the option ``--boxes``; ``where`` names the affected outputs and the default."""
+    """Return the option ``--boxes``; ``where`` is its help, with ``{}`` for the values' meaning."""
     about = "boxes enclose whole objects (full) or their visible parts"
     return click.option("--boxes", type=click.Choice(["full", "visible"]), help=where.format(about))
 

@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 _MOST_ROWS = 100
 _THREADS = 16
-"""Threads that read complete runs: at a URL, each is a round trip."""
+"""Number of threads that read complete runs; at a URL, each run takes a round trip."""
 
 
 class Outcomes:
     """Counts of the outcomes of a batch, and the complete recordings to print.
 
-    It keeps the first 100, or all if ``keep_all``, and every run that received labels from replaced
-    results.
+    It keeps the first 100 complete recordings, or all if ``keep_all``, and every one whose replaced
+    results had corrected labels.
     """
 
     def __init__(self, *, keep_all: bool) -> None:
@@ -54,7 +54,7 @@ class Outcomes:
 
 
 def print_closing(tasks: Sequence["Task"], tally: Outcomes) -> None:
-    """Print the complete recordings if there are at most 100, transferred labels, and totals."""
+    """Print the complete recordings, if at most 100, then the transferred labels and the totals."""
     complete = tally.in_order(tasks)
     if 0 < tally.complete <= _MOST_ROWS:
         columns = ("recording", "frames", "seconds", "tracks", "results")

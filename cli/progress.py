@@ -134,7 +134,7 @@ class Progress:
             self.show_ended(outcome)
 
     def remaining_s(self) -> float | None:
-        """Return the estimated seconds left, from the bytes done so far; None before the first.
+        """Return the estimated seconds left, from the bytes done so far; None if there are none.
 
         The time for loading and compiling, before the first frame, is excluded.
         """
@@ -297,7 +297,7 @@ class LiveProgress(Progress):
         self._rich.update(bar, description=text, completed=done, total=total)
 
     def show_ended(self, outcome: "Outcome") -> None:
-        """Remove the bar of a recording; print its error if it failed."""
+        """Remove the bar of a recording; print its error or warnings."""
         bar = self._bars.pop(outcome.job.folder.name, None)
         if bar is not None:
             self._rich.remove_task(bar)

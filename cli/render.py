@@ -27,7 +27,7 @@ PHASES = {
 }
 
 _WIDEST = 100_000
-"""Width in characters of a table for a file or another program, which is never folded."""
+"""Width, in characters, of tables for a file or another program; their lines are not folded."""
 
 
 class Bars:
@@ -76,7 +76,7 @@ def print_json(value: Any) -> None:
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print a table with right-aligned columns of numbers; names are printed as they are.
+    """Print a table with right-aligned columns of numbers; text is not interpreted as markup.
 
     On a terminal, lines are folded to its width.
     """

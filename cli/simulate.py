@@ -27,7 +27,7 @@ _SENSORS = (
     "phone",
 )
 _SUFFIXES: "dict[FormatName, str]" = {"mcap": ".mcap", "ros1": ".bag", "ros2": ""}
-"""Repeated here so that ``--help`` does not load the simulator."""
+"""Suffix by format. All three are repeated here, so that ``--help`` does not load the simulator."""
 
 
 @click.command()
