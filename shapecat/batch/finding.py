@@ -38,7 +38,7 @@ _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 class SearchResult:
     """The recordings that a search found, without duplicates.
 
-    ``skipped`` counts the files that are no recordings. ``notes`` report each path that leads to
+    ``skipped`` counts the files that are not recordings. ``notes`` report each path that leads to
     the same recording as an earlier path, and each folder without a recording, such as a disk that
     is not mounted.
     """
@@ -52,10 +52,10 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
     """Return the recordings among files, folders and URLs.
 
     A pattern such as ``*.mcap`` is expanded here too, as programs may call the command without a
-    shell; a file with this very name comes first. Folders are searched recursively; hidden files,
-    hidden folders and run folders are left out, and a ROS 2 bag counts as one recording. A file
-    that is the only source is always kept. Of several files, those with neither the suffix nor the
-    first bytes of a recording are skipped and counted, so that ``folder/*`` works.
+    shell; a file with this very name takes precedence. Folders are searched recursively; hidden
+    files, hidden folders and run folders are left out, and a ROS 2 bag counts as one recording. A
+    file that is the only source is always kept. Of several files, those with neither the suffix nor
+    the first bytes of a recording are skipped and counted, so that ``folder/*`` works.
 
     Raises
     ------
@@ -166,8 +166,8 @@ def _follow_in_time(paths: Sequence[Path]) -> bool:
 def _search(folder: Path, searched: set[Path]) -> Iterator[Path]:
     """Yield the recordings below a folder; each folder is sorted by name, symbolic links last.
 
-    No folder is searched twice, so links may form loops. A folder that may not be read, such as
-    ``lost+found``, is skipped, and the log says so.
+    Folders in ``searched`` (resolved paths; updated in place) are left out, so links may form
+    loops. A folder that may not be read, such as ``lost+found``, is skipped, and the log says so.
     """
     real = _real_path(folder)
     if real in searched:

@@ -196,7 +196,7 @@ class RemoteManifest(Manifest):
                 self._merge(((self._parts / name).read() or b"").splitlines())
 
     def begin(self) -> bytes:
-        """Return the file that the summary at the end would replace; empty if it is missing."""
+        """Return the content of the existing summary; empty if there is none."""
         return self._summary.read() or b""
 
     def _merge(self, lines: Iterable[bytes]) -> None:
@@ -300,7 +300,7 @@ def _interned(name: str, value: Any) -> Any:
 
 @contextmanager
 def _appending(path: Path) -> Iterator[int]:
-    """Open a file for appending, and lock it until the block or the process ends."""
+    """Yield the descriptor of a file open for appending, locked until the block or process ends."""
     path.parent.mkdir(parents=True, exist_ok=True)
     file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
     try:

@@ -21,7 +21,7 @@ __all__ = ["existing_names", "name_folders"]
 
 _NUMBER = re.compile(r"_\d+$")
 _PARTIAL = re.compile(re.escape(partial_path(Path("*")).name).replace(r"\*", "(.+)"))
-"""The names of interrupted runs."""
+"""Pattern of the folders of interrupted runs; its group is the name of the run."""
 
 
 def name_folders(
@@ -63,7 +63,7 @@ def name_folders(
 def existing_names(
     sources: Sequence[Source], out: str, listing: set[str], noted: Mapping[str, Entry]
 ) -> dict[int, str]:
-    """Map the index of each recording that already has a run folder in ``out`` to its name.
+    """Map the index of each recording that already has a run folder to the folder's name.
 
     Without these names, a recording that is added to a batch later, or processed alone, would
     change the name of another run, be it complete, interrupted or failed. A recording is left out

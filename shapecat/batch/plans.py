@@ -160,7 +160,8 @@ def plan_batch(
     ------
     ConfigError : the shard is invalid, or a URL needs a library that is not installed.
     RecordingError : no recording was found, or a URL cannot be reached.
-    OutputError : the URL for the results cannot be reached.
+    ModelError : the model cannot be read.
+    OutputError : the URL for the results cannot be reached, or shapecat did not make the manifest.
     """
     part = parse_shard(shard) if shard is not None else None
     found = find_recordings(sources)
@@ -302,7 +303,10 @@ def run_of(job: Job) -> RunInfo:
 
 
 def _input_key(source: Path) -> tuple[str, int]:
-    """Return a key of a recording's files, from names, sizes and times, and their total bytes."""
+    """Return a key from the names, sizes and times of a recording's files, and their total bytes.
+
+    The result is empty and 0 if a file cannot be read.
+    """
     try:
         stats = file_stats(source)
     except OSError:

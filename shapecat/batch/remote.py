@@ -56,7 +56,7 @@ def process_remote(job: Job, observe: Observer, *, cores: int, batch: str) -> Su
             _write_keys(job, local.folder)
             upload(local.folder, job.target, claim)
         elif claim is not None and all(job.keys.values()):
-            # A copy of an earlier run: with the keys, it is not downloaded again.
+            # The run was complete already. With the keys, its recording is not downloaded again.
             _write_keys(job, local.folder)
             claim.require()
             (Location(job.target, OutputError) / "run.json").upload(local.folder / "run.json")

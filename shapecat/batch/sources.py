@@ -58,7 +58,7 @@ def is_compressed(name: str) -> bool:
 def is_named_as_bag(folder: str, names: Collection[str]) -> bool:
     """Return whether the names of a folder and of its files suffice to call it a ROS 2 bag.
 
-    This is so if the files are numbered parts with the name of the folder, or one is compressed.
+    The files must be numbered parts, and have the name of the folder unless one is compressed.
     """
     parts = parts_among(names)
     any_compressed = any(name.endswith(".zstd") for name in names)

@@ -253,7 +253,7 @@ class Location:
             yield from self._list_pages(deep=deep)
         elif deep:
             found = self._retry("listed", lambda: system.find(path, detail=True))
-            # Of a path that is a file, as is a page without links, the info is empty.
+            # For a path that is a file, such as a page without links, the info is empty.
             yield from ({"name": name, **info} for name, info in found.items())
         else:
             yield from self._retry("listed", lambda: system.ls(path, detail=True))
