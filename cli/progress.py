@@ -91,7 +91,7 @@ class Progress:
         """Leave the display as it is."""
 
     def plan(self, text: str) -> None:
-        """Show the summary of the plan."""
+        """Show the summary of the plan, in subclasses."""
 
     def progress(self, folder: str, phase: str, done: int, total: int | None) -> None:
         """Receive the progress of the recording with this run folder; total is None if unknown."""
@@ -153,7 +153,7 @@ class Progress:
         click.echo(text, err=True)
 
     def show(self, folder: str) -> None:
-        """Show the progress of a recording."""
+        """Show the progress of a recording, in subclasses."""
 
     def show_ended(self, outcome: "Outcome") -> None:
         """Show the error of a recording, or the warnings about its new results."""

@@ -60,6 +60,7 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
     Raises
     ------
     RecordingError : no recording was found, or a URL cannot be reached.
+    ConfigError : a URL needs a library that is not installed.
     """
     search = search_url if len(sources) == 1 else search_url_beside_others
     remote = {found.url: found for source in sources if is_url(source) for found in search(source)}
@@ -153,7 +154,7 @@ def _has_bag_metadata(folder: Path) -> bool:
 def _follow_in_time(paths: Sequence[Path]) -> bool:
     """Return whether each recording begins at most 10 s after the end of the one before it.
 
-    Unreadable recordings are ignored; at least two must be left.
+    Unreadable recordings, and those without messages, are ignored; at least two must be left.
     """
     spans = []
     for path in paths:

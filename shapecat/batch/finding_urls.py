@@ -43,6 +43,7 @@ def search_url(url: str) -> list[Source]:
     Raises
     ------
     RecordingError : the storage cannot be reached.
+    ConfigError : a library is not installed.
     """
     location = Location(url)
     if any(character in url.partition("?")[0] for character in "*["):  # signed URLs have queries
@@ -72,6 +73,11 @@ def search_url_beside_others(url: str) -> list[Source]:
 
     A URL where nothing exists is returned as a recording, and fails when it is opened, like a
     missing file. A folder without recordings is logged.
+
+    Raises
+    ------
+    RecordingError : the storage cannot be reached.
+    ConfigError : a library is not installed.
     """
     found = search_url(url)
     if found or next(Location(url).walk(deep=False), None) is None:
@@ -144,7 +150,7 @@ def _search_remote_folder(location: Location) -> Iterator[Source]:
 
 
 def _bags_among(folders: Iterable[str]) -> list[str]:
-    """Return those of the folders (URLs) that hold the metadata.yaml of a ROS 2 bag."""
+    """Return the folders (URLs) that hold the metadata.yaml of a ROS 2 bag, sorted."""
 
     def is_bag(folder: str) -> bool:
         return BAG_KEY in ((Location(folder) / "metadata.yaml").read() or b"")[:METADATA_BYTES]

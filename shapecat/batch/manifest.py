@@ -142,8 +142,9 @@ class RemoteManifest(Manifest):
     """A manifest at a URL, in parts: ``.manifest/SHARD/PART.jsonl``.
 
     Each part has one writer. Every few seconds the writer replaces its last part by a longer one,
-    until the part holds a megabyte. At the end, ``manifest.jsonl`` gets the last line of each
-    recording. Lines that a killed writer had not sent are recovered from the run folders.
+    until the part holds a megabyte. At the end, ``manifest.jsonl`` or ``manifest-SHARD.jsonl`` gets
+    the last line of each recording. Lines that a killed writer had not sent are recovered from the
+    run folders.
     """
 
     def __init__(self, url: str, shard: str = "") -> None:

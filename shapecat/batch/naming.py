@@ -74,6 +74,10 @@ def existing_names(
     out : folder or URL of the batch.
     listing : the names in ``out``.
     noted : entries of the manifest in a folder; at a URL, the entries of all shards are read.
+
+    Raises
+    ------
+    OutputError : the storage at a URL cannot be read.
     """
     counts = Counter(source.stem for source in sources)
     ambiguous = {

@@ -261,7 +261,7 @@ def _names_in(folder: Path) -> set[str]:
 def _is_wanted_run(task: Task, model_id: str) -> bool:
     """Return whether a run listed as complete is the requested one, and has its outputs.
 
-    A command for this recording alone, or with other shards, may have replaced it, and an
+    A command for this recording alone, or with other shards, may have replaced the run, and an
     interrupted `annotate` leaves outputs missing.
     """
     job = task.job

@@ -76,7 +76,7 @@ def _write_keys(job: Job, folder: Path) -> None:
 
 
 def _process(job: Job, local: Job, observe: Observer, cores: int) -> Summary:
-    """Process a job in the temporary folder; error messages name the URLs instead of it."""
+    """Process ``local``, a job in the temporary folder; error messages name the URLs of ``job``."""
     try:
         return process(local, observe, cores=cores)
     except ShapecatError as error:
@@ -113,9 +113,9 @@ def _fetch_run(job: Job) -> tuple[Job, RunInfo | None]:
 
     Returns
     -------
-    The job, and the content of run.json, which is None if there is no run or the job overwrites it.
-    If run.json is missing at the target, ``overwrite`` is set in the job, since the replacement of
-    an earlier run may have been interrupted.
+    The job, and the content of run.json, or None if there is no run or the job overwrites it. If
+    run.json is missing at the target, ``overwrite`` is set in the job, since the replacement of an
+    earlier run may have been interrupted.
 
     Raises
     ------

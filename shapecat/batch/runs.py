@@ -35,8 +35,8 @@ _POLL_S = 0.1
 
 _Finished = tuple[Task, Future[Outcome]]
 _Report = Callable[[str, str, int, int | None], None]
-"""Called with the run folder of a recording, its phase, the frames done, and the total (None if
-unknown), possibly from several threads."""
+"""Called with the name of a recording's run folder, the phase, the frames done, and the total (None
+if unknown), possibly from several threads."""
 
 
 def process_here(
@@ -151,7 +151,10 @@ def _give_up(job: Job, error: BaseException) -> Outcome:
 
 
 def _attempt_on_worker(job: Job, address: str, cores: int, batch: str, version: str) -> Outcome:
-    """Process one job in a worker; refuse a command from a different version of shapecat."""
+    """Process one job in a worker; refuse a command from a different version of shapecat.
+
+    ``address`` is that of the `ProgressReceiver`, ``version`` that of the command's shapecat.
+    """
     if version != __version__:
         versions = f"a worker has shapecat {__version__}, this command {version}"
         return _failed(job, f"{versions}; install one version")

@@ -22,7 +22,7 @@ __all__ = ["Location", "content_key", "is_url", "names_in"]
 _T = TypeVar("_T")
 
 _WAITS_S = (0.5, 1.0, 2.0, 4.0, 8.0)
-"""Waits between attempts, randomized by half, so that refused workers do not return together."""
+"""Waits between attempts. Each is varied by up to half, so that workers do not return together."""
 _DIGESTS = ("ETag", "etag", "md5Hash", "content_md5", "Content-MD5", "Digest")
 _TIMES = ("mtime", "LastModified", "last_modified", "Last-Modified", "created")
 """Entries of a file's info that change with its content, or with the time it was written."""
@@ -79,7 +79,7 @@ def _decoded(name: str) -> str:
 def content_key(info: Mapping[str, Any]) -> str:
     """Return a key that changes with a file's content, from its size and its digest or times.
 
-    It is empty if neither is known.
+    It is empty if neither digest nor time is known.
     """
     names = _DIGESTS if any(info.get(name) for name in _DIGESTS) else _TIMES
     values = [info[name] for name in names if info.get(name) is not None]
@@ -113,7 +113,7 @@ class Location:
 
     @property
     def root(self) -> str:
-        """The URL of this folder, spelt as at the start of the URLs that `walk` yields."""
+        """The URL of this folder, as at the start of the URLs that `walk` yields."""
         return self._url_of({"name": self._path})
 
     def _retry(self, participle: str, call: Callable[[], _T]) -> _T:
@@ -228,7 +228,7 @@ class Location:
         return {PurePosixPath(url).name for url, _ in self.walk(deep=False)}
 
     def walk(self, *, deep: bool = True) -> Iterator[tuple[str, Mapping[str, Any]]]:
-        """Yield URL and info of the files in a folder, which need not exist.
+        """Yield URL and info, as from `info`, of the files in a folder, which need not exist.
 
         Parameters
         ----------

@@ -35,7 +35,7 @@ def distort(rays: F8, model: str, coefficients: Sequence[float]) -> F8:
     Parameters
     ----------
     model : one of `LENS_MODELS`, or empty for a lens without distortion.
-    coefficients : in OpenCV's order, at most 8; missing ones are 0.
+    coefficients : in OpenCV's order; missing ones are 0, and only the first 8 are used.
 
     Raises
     ------

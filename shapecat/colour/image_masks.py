@@ -21,6 +21,10 @@ def find_masks(frame: Frame, view: ColourView, objects: Sequence[U4]) -> ImageMa
     ----------
     view : the colour image with its camera.
     objects : for each detection, (k,) uint32 flat indices of its pixels in the frame.
+
+    Raises
+    ------
+    ValueError : the distortion model of the colour camera is not known.
     """
     image = view.image
     masks: tuple[Mask, ...] = ()

@@ -80,7 +80,7 @@ def dense_masks(
 
     Raises
     ------
-    ValueError : the frame is not a depth image.
+    ValueError : the frame is not a depth image, or the distortion model is not known.
     """
     if frame.depth is None or frame.camera is None:
         msg = "masks need a depth image"

@@ -78,6 +78,10 @@ def rectified(pixels: U1, lens: LensCamera) -> U1:
     """Return a colour image, ``pixels`` (h, w, 3) uint8, without the distortion of its lens.
 
     Colours are interpolated bilinearly. Pixels outside the original image are black.
+
+    Raises
+    ------
+    ValueError : the distortion model is not known.
     """
     if not lens.model:
         return pixels

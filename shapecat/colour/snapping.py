@@ -80,8 +80,7 @@ class _Match(NamedTuple):
 def _match(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> _Match:
     """Return the pixels that match a mask; ``owners`` (h, w) is the number of each pixel's mask.
 
-    ``pixels`` (h, w, 3) is the colour image; ``scale`` multiplies the distances `_BAND_PX` and so
-    on.
+    ``pixels`` (h, w, 3) is the colour image; ``scale`` is as in `snapped`.
     """
     band_px, radius = max(2.0, _BAND_PX * scale), max(3, round(_WINDOW_PX * scale))
     margin, (left, top, width, height) = int(band_px) + radius, mask.box

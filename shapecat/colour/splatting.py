@@ -48,6 +48,10 @@ def splat_depth(
     boxes : (n + 1, 4) bounding box of each label's pixels, including hidden ones: left, top,
         right + 1, bottom + 1, in pixels of ``labels``; zeros for a label without pixels.
 
+    Raises
+    ------
+    ValueError : the distortion model is not known.
+
     Notes
     -----
     Time grows with the pixels of the objects, the pixels that they cover, and a sixteenth of the

@@ -1,4 +1,4 @@
-"""Find a usable calibration of a camera: some drivers publish zeros before they know it."""
+"""Find a usable calibration of a camera, since some drivers publish zeros at first."""
 
 from contextlib import suppress
 from typing import Any

@@ -46,8 +46,8 @@ _PATIENCE_NS = 500_000_000
 _USUAL_PERIOD_NS = 100_000_000
 """Period assumed for a colour stream if it has too few messages to measure one, nanoseconds."""
 KnownImages: TypeAlias = Callable[[str, int], int | None] | None
-"""A function that returns the log time (ns) of a frame's colour image, given the frame's topic and
-number; None if it has no image."""
+"""A function that returns the log time (ns) of a frame's colour image, or None if it has no image,
+given the frame's topic and number; None if the images are not known."""
 
 
 def frames_with_colour(

@@ -111,7 +111,7 @@ def _errors(camera: Camera, sample: tuple[F8, F8, F8, F8]) -> tuple[float, float
 
 
 def _sample(points: F4) -> tuple[F8, F8, F8, F8] | None:
-    """Return u, v, x / z and y / z, each (n,), of sampled points; None if there are few."""
+    """Return u, v, x / z and y / z, each (n,), of sampled points; None if there are too few."""
     sampled = sample_pixels(points, lambda flat: flat[:, 2] > 0)
     if sampled is None:
         return None

@@ -122,7 +122,7 @@ def _are_twins(a: Stream, b: Stream, first: _Place, second: _Place) -> bool:
     Their topics are then the same after the namespace, but have different calibrations. Clouds have
     no calibration, so the last two components of their topics are compared instead. Two namespaces
     with the same first component (``/kinect2/hd``, ``/kinect2/qhd``) belong to one driver. If one
-    namespace ends in the other, it holds a copy, such as throttled topics.
+    namespace ends with the other, it holds a copy, such as throttled topics.
     """
     short, long = sorted((first.space, second.space), key=len)
     copied = first.space[:1] == second.space[:1] or long[len(long) - len(short) :] == short

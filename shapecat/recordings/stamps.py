@@ -51,7 +51,7 @@ class Estimates:
         return max(log_time_ns - self._delays[topic], 0)
 
     def _delays_of(self, topic: str) -> Iterator[int]:
-        """Yield log time minus stamp (ns) for those of the first messages with a stamp."""
+        """Yield log time minus stamp (ns) for each stamp in the first messages of a topic."""
         for message in islice(self._recording.messages([topic]), _FIRST):
             with suppress(MessageError, *MALFORMED):
                 decoded = self._recording.decode(message)

@@ -220,9 +220,9 @@ def first_message(recording: Recording, topic: str) -> Any:
 def first_messages(
     recording: Recording, topic: str, kind: str | None = None, *, most: int = _PEEK
 ) -> Iterator[Any]:
-    """Yield those of a topic's first ``most`` messages that can be decoded.
+    """Yield a topic's first ``most`` messages, decoded; leave out any that cannot be decoded.
 
-    ``kind`` is the type of these messages; None for any type.
+    Only messages of the type ``kind`` count, unless it is None.
     """
     of_type = (m for m in recording.messages([topic]) if kind is None or m.type == kind)
     for message in islice(of_type, most):

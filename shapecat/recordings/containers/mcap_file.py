@@ -218,8 +218,8 @@ class McapRecording(ChunkedRecording):
         """Yield the messages of a chunk, at least up to the last needed one.
 
         The rest is not decompressed unless it is short: often only transforms or a few images are
-        needed. If the selection has ``needed``, all messages that were not read, or that damage has
-        destroyed, follow without data, so that frames have the same numbers whatever is needed.
+        needed. If the selection has ``needed``, all messages that were not read or are damaged
+        follow without data, so that frames have the same numbers whatever is needed.
         """
 
         def is_needed(message: IndexedMessage) -> bool:

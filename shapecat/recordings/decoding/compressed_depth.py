@@ -80,7 +80,7 @@ def _read_png(data: bytes) -> U2:
 
 
 def _read_rvl(data: bytes) -> U2:
-    """Read RVL data: width, height, then nibbles in little-endian 32-bit words."""
+    """Read RVL data as (h, w): width, height, then nibbles in little-endian 32-bit words."""
     width, height = struct.unpack_from("<II", data)
     words = np.frombuffer(data, "<u4", (len(data) - 8) // 4, 8)
     # A nibble can hold a run of zeros of any length, so only the number of pixels is checked.

@@ -23,7 +23,8 @@ def cloud_points(message: Any) -> F4:
 
     Returns
     -------
-    (h, w, 3) float32 metres, as recorded: coordinates may be NaN, infinite or zero.
+    (h, w, 3) float32 metres, as recorded: coordinates may be NaN, infinite or zero. w is 0 if the
+    cloud is empty.
 
     Raises
     ------

@@ -179,8 +179,8 @@ class PoseFinder:
         """Choose one fixed frame for all sensors, preferably one named map, odom or world.
 
         A coordinate frame in which sensor poses are known halfway through the recording is
-        preferred, since objects are tracked in it only if most images have a pose. Returns None if
-        there is no such frame.
+        preferred, since objects are tracked in it only if most images have a pose. Without one in
+        the transforms, the result is the frame of the first cloud if that has a pose, else None.
         """
         halfway_ns = first.stamp_ns + max(0, self.middle_ns - first.log_time_ns)
         candidates = [
@@ -208,7 +208,7 @@ class PoseFinder:
     def accept(self, topic: str, orientation: Orientation) -> F4 | None:
         """Return the up direction of a frame, and count it by its source.
 
-        It is None if the direction is unknown, or dropped for this topic.
+        The result is None if the direction is unknown, or dropped for this topic.
         """
         up = None if topic in self.dropped else orientation.up
         source = "planes" if up is None else orientation.source

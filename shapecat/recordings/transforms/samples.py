@@ -26,15 +26,15 @@ TOLERANCE_NS = 100_000_000
 near the ends of a gap."""
 _NEVER_NS = 2**63
 _GAP_NS = 500_000_000
-"""Shorter intervals between two samples are no gaps: slow localization publishes as rarely."""
+"""Shorter intervals between two samples are not gaps: slow localization publishes as rarely."""
 _UNUSUAL = 3
 """A gap is longer than this many times the mean of the other intervals, so that transforms at a low
 rate have no gaps."""
 _LONGEST_NS = 10_000_000_000
 """Longer intervals count as this long in the mean: what lies between may not have been read."""
 _SET_BACK_NS = 1_000_000_000
-"""A clock was set back if a stamp is farther than this before an earlier one; late messages are
-nearer."""
+"""A clock was set back if a stamp is more than this before the stamp of an earlier message. Late
+messages differ by less."""
 _MOVED_M = 0.02
 """Samples that differ by less than this and `_TURNED` are close. If the two around a gap are close,
 they are interpolated: the frame was at rest, as in transforms that are published only on change, or
