@@ -125,6 +125,7 @@ def _is_bag(folder: Path) -> bool:
 
     ROS 2 names the parts of a bag a/a_0.mcap, a/a_1.mcap, ... In a folder with another name, such
     files may be separate recordings, unless they follow each other in time, or one is compressed.
+    A folder with a single .db3 file is a bag; without metadata, one with subfolders is not.
     """
     try:
         if _has_bag_metadata(folder):

@@ -32,7 +32,7 @@ def process_remote(job: Job, observe: Observer, *, cores: int, batch: str) -> Su
     """Download the recording of a job, process it, and upload the results.
 
     ``batch`` identifies the command that sent the job. If a run at the target has the keys of the
-    job, its summary is returned, and nothing is processed.
+    job, and the job does not overwrite it, its summary is returned, and nothing is processed.
 
     Raises
     ------

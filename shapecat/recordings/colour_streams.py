@@ -77,7 +77,7 @@ def pair_colours(
     """Choose the colour streams of depth streams.
 
     A cloud with colours is its own colour stream. Colour images belong to a depth stream if they
-    have the same frame or if the topic names begin with the same namespace
+    have the same frame. They also do if the topic names begin with the same namespace
     (``/camera/color/image_raw`` and ``/camera/depth/image_raw``), unless their topic shares more of
     its namespace with another depth sensor. If a recording has one depth sensor and one stream of
     colour images, raw or compressed or both, they belong together whatever their names.

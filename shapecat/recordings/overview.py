@@ -17,8 +17,8 @@ __all__ = ["describe_recording"]
 def describe_recording(path: Path) -> dict[str, Any]:
     """Return a recording's path, kind, size, times, topics with their use, and warnings.
 
-    The keys are ``path``, ``kind``, ``bytes``, ``start_ns`` (log time), ``seconds``, ``topics``,
-    each with ``name``, ``type``, ``encoding``, ``count`` and ``use``, and ``warnings``.
+    The keys are ``path``, ``kind``, ``bytes``, ``start_ns`` (log time), ``seconds``, ``warnings``
+    and ``topics``. Each topic has ``name``, ``type``, ``encoding``, ``count`` and ``use``.
 
     Raises
     ------

@@ -165,7 +165,7 @@ class DepthSource(FrameSource):
             self._info, self._info_stamp = info, stamp
 
     def read(self, message: Message, index: int) -> Iterator[Frame]:
-        """Hold an image back until its calibration arrives; yield the frame of the previous one."""
+        """Yield the frame of the previous image, and that of this one if its calibration came."""
         yield from self.finish()
         with self.counting():
             image = self.recording.decode(message)

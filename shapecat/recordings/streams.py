@@ -51,9 +51,8 @@ def depth_streams(recording: Recording, requested: Sequence[str] = ()) -> tuple[
 
     The encoding of the first few images (some may be blank) distinguishes depth from colour.
     Topics named after other images, such as confidence or disparity, are left out unless they are
-    ``requested``, with or without a leading slash. A depth image is paired with the calibration in
-    its own namespace (``depth/image_raw`` with ``depth/camera_info``), or with the only one in the
-    recording.
+    ``requested``, with or without a leading slash. `info_topic_of` finds the calibration of a depth
+    image, usually in its own namespace (``depth/image_raw`` with ``depth/camera_info``).
     """
     streams = []
     named = {name.strip("/") for name in requested}

@@ -137,7 +137,12 @@ class FolderRecording(Recording):
             self.warn(f"skipped {reason}")
 
     def _decompressed(self, file: Path) -> Path:
-        """Decompress a file into a temporary folder, using at most half of the free space."""
+        """Decompress a file into a temporary folder; return its path there.
+
+        Raises
+        ------
+        RecordingError : the file is damaged, or needs more than half of the free space.
+        """
         if self._scratch is None:
             self._scratch = self._cleanup.enter_context(scratch_folder())
         plain = self._scratch / file.stem
