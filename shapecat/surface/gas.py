@@ -23,9 +23,9 @@ _SPACING_SAMPLES = 64
 """Approximate number of points whose distance to the nearest other point is averaged."""
 _RATES = Rates(winner=0.1, neighbour=0.006, oldest=30)
 _GROWTH = 0.6
-"""Fraction of the signals within which all neurons are inserted."""
+"""Fraction of the signals after which all neurons have been inserted."""
 _EPOCHS = 8
-"""Maximum number of epochs of the thesis's rule, which rarely reaches its distance limit sooner."""
+"""Maximum number of epochs of Algorithm 4, which rarely reaches its distance limit sooner."""
 _ERROR_LIMIT = 3.0
 """Error limit (t_gamma in the thesis), relative to the error that a neuron collects in an epoch if
 all neurons have equal shares of the surface."""
@@ -52,9 +52,9 @@ def reconstruct(
 
     Returns
     -------
-    A connected graph of at least 3 neurons, each within the convex hull of the points and nearest
-    to at least one of them. None if there are fewer than `MIN_POINTS` points, or if they lie in so
-    few places that fewer than 3 neurons remain.
+    A connected graph of at least 3 neurons, each the mean of some of the points. None if there are
+    fewer than `MIN_POINTS` points, or if they lie in so few places that fewer than 3 neurons
+    remain.
 
     Raises
     ------
@@ -128,9 +128,9 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U
 
 @kernel(inner=True)
 def _normalise(points: F4) -> tuple[Cloud, F8]:
-    """Return at most `_MAX_POINTS` points, shifted and scaled to -1 to 1; and shift and scale (4,).
+    """Return at most `_MAX_POINTS` points, normalised to -1 to 1, and the shift and scale (4,).
 
-    These are x, y, z of the mean, and the largest distance from the mean along an axis.
+    The shift is the mean (x, y, z), the scale the largest distance from it along an axis, metres.
     """
     step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
     size = (points.shape[0] + step - 1) // step
@@ -172,7 +172,10 @@ def _target_size(cloud: Cloud, neurons: int) -> int:
 
 @kernel
 def _link_two_points(cloud: Cloud, gas: Gas, state: np.uint64) -> None:
-    """Do steps 1 to 3: begin with two linked neurons at random points, one from each half."""
+    """Do steps 1 to 3 of both algorithms: link two neurons at random points.
+
+    One point is from each half of ``cloud``; ``state`` is 64 random bits.
+    """
     half = cloud.x.size // 2
     for i in range(2):
         k = i * half + np.int64((state >> np.uint64(20 * i)) % np.uint64(half))

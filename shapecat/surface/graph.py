@@ -1,4 +1,4 @@
-"""Turn a grown gas into a connected graph in which every neuron is nearest to some point."""
+"""Turn a grown gas into a connected graph without unused neurons."""
 
 import numpy as np
 
@@ -24,10 +24,10 @@ def finish_graph(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
     1. Remove neurons that are nearest to no point.
     2. Move each neuron to the mean of the points it is nearest to (one step of Lloyd 1982). This
        removes the pull of the last signals, and keeps neurons within the convex hull.
-    3. Link two neurons if the gas linked them, if they are the two nearest to some point
-       (competitive Hebbian learning, Martinetz and Schulten 1994), or if they are among the three
-       nearest to some point and not far apart. With the links of the gas alone, a third of the
-       neurons are in no triangle.
+    3. Link two neurons if the gas linked them, if they were the two nearest to some point before
+       step 2 (competitive Hebbian learning, Martinetz and Schulten 1994), or if they were among the
+       three nearest and are not far apart. With the links of the gas alone, a third of the neurons
+       are in no triangle.
     4. Remove components with less than a minimum fraction of the points, but never the largest.
     5. Connect the remaining components where they are nearest to each other.
 
@@ -166,10 +166,10 @@ def _squared_distance(gas: Gas, i: int, j: int) -> float:
 
 @kernel(inner=True)
 def _compact(gas: Gas, adjacent: Bool, members: I4, stays: Bool, count: int) -> int:
-    """Move those of ``count`` neurons that stay to the front; return their number.
+    """Drop some of ``count`` neurons and close the gaps, in order; return how many remain.
 
-    ``stays`` (count,) says which stay. ``adjacent`` (count, count) and ``members`` (count,), the
-    number of points of each neuron, are changed too.
+    ``stays`` (count,) marks those that remain. ``adjacent`` (count, count) and ``members``, the
+    number of points of each neuron (count,), are changed too.
     """
     n = 0
     for i in range(count):

@@ -134,7 +134,7 @@ def grow_fritzke(
     interval: int,
     rates: Rates,
 ) -> int:
-    """Adapt a gas of two neurons to signals from a cloud and insert more; return how many it has.
+    """Grow a gas of two neurons with signals from a cloud; return its number of neurons.
 
     Source: Fritzke 1995, thesis Algorithm 3, whose steps are numbered here and in
     `_adapt_to_signal`; steps 1 to 3 are the caller's.
@@ -218,8 +218,8 @@ def grow_thesis(
     cloud, state, gas, rates : as in `grow_fritzke`.
     target : maximum number of neurons.
     epochs : maximum number of times that each point is presented.
-    error_limit : squared distance, in the units of ``cloud`` (t_gamma).
-    distance_limit : distance, in the units of ``cloud`` (t_alpha).
+    error_limit : sum of squared distances, in the squared unit of ``cloud`` (t_gamma).
+    distance_limit : distance, in the unit of ``cloud`` (t_alpha).
     """
     points = cloud.x.size
     px, py, pz = cloud
@@ -264,9 +264,10 @@ def grow_thesis(
 
 @kernel(inline=True)
 def _prune(gas: Gas, count: int, before: I4) -> int:
-    """Remove neurons whose ``wins`` are still as in ``before``, but keep 3; return their number.
+    """Remove neurons whose ``wins`` are still as in ``before``; return how many remain.
 
-    The others move to the front, and so do their elements of ``before`` (count,).
+    At least 3 remain. The last neurons, with their elements of ``before`` (count,), take the places
+    of removed ones.
     """
     i = 0
     while i < count:

@@ -127,7 +127,7 @@ def insert(gas: Gas, count: int, q: int) -> int:
 
 @kernel(inline=True)
 def move(gas: Gas, last: int, place: int) -> None:
-    """Move neuron ``last`` to the free index ``place``."""
+    """Move neuron ``last``, the last one, to the free index ``place``; its error is not moved."""
     size = gas.x.size
     if last != place:
         gas.x[place], gas.y[place], gas.z[place] = gas.x[last], gas.y[last], gas.z[last]

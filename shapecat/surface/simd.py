@@ -115,7 +115,7 @@ def _nearest(count: int) -> Callable[..., Any]:
     """Return an intrinsic of numba that finds the ``count`` neurons nearest to a point."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> _Value:
-        """Emit the instructions of ``search``, below."""
+        """Emit the instructions of ``search``, below, for ``args``; return its result."""
         v, build = _Vectors(context, builder), builder
         arrays = [v.array(signature.args[k], args[k]) for k in range(3)]
         padded, place, mask = args[3], [v.splat(value, _FLOATS) for value in args[4:7]], args[7]
@@ -208,7 +208,7 @@ def adapt(
 
 
 def _emit_adapt(context: Any, builder: Any, signature: Any, args: Any) -> _Value:
-    """Emit the instructions of `adapt`, as an intrinsic of numba does; the largest is returned."""
+    """Emit the instructions of `adapt` for the arguments ``args``; return its result."""
     v, build = _Vectors(context, builder), builder
     arrays = [v.array(signature.args[k], args[k]) for k in range(3)]
     padded, place = args[3], [v.splat(value, _FLOATS) for value in args[4:7]]

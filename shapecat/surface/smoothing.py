@@ -22,13 +22,14 @@ _SQUARINGS = 6
 def thin(points: F4, *, settings: SurfaceSettings) -> F4:
     """Thin the points of an object for the gas: return (m, 3) metres, one point for each voxel.
 
-    The points of each voxel are averaged, and the averages are smoothed if the settings ask for it.
-    differs: the thesis smooths the whole cloud before thinning; smoothing the thinned points of an
-    object takes a hundredth of the time, and removes the noise that the averages leave.
+    The points of each voxel are averaged, and the averages are smoothed (differs: the thesis
+    smooths the whole cloud before thinning). Smoothing the thinned points of an object takes a
+    hundredth of the time, and removes the noise that the averages leave.
 
     Parameters
     ----------
     points : (n, 3) metres, finite, in any frame.
+    settings : ``voxel_m`` and ``smooth_radius_m`` are used; a radius of 0 means no smoothing.
 
     Raises
     ------
@@ -63,8 +64,8 @@ def smooth(points: F4, *, radius_m: float) -> F4:
 
     Raises
     ------
-    ValueError : a point is not finite, the radius is not positive, or the cloud spans 2**20 radii
-        or more.
+    ValueError : the points are not (n, 3) or not finite, the radius is not positive, or the cloud
+        spans 2**20 radii or more.
 
     Notes
     -----
@@ -100,7 +101,7 @@ def _cells(points: F4, radius: float) -> tuple[I4, I4]:
 
 @kernel
 def _smooth(points: F4, radius: float, cells: I4, size: I4, order: I4) -> F4:
-    """Return the moved points (m, 3), metres.
+    """Return the moved points (m, 3), metres; ``points`` and ``radius`` are as in `smooth`.
 
     ``cells`` (n,) and ``size`` (3,) are from `_cells`; ``order`` (n,) sorts the points by cell.
     """
@@ -132,8 +133,8 @@ def _neighbours(
     """Write the neighbours of point i to ``offsets``, and return their number.
 
     A row of ``offsets`` (n, 4) is the offset of a neighbour from the point, in radii, and the
-    weight of the neighbour. ``cell`` is the point's cell, ``keys`` are the cells in the order
-    ``order``; the other parameters are as in `_smooth`.
+    weight of the neighbour. ``cell`` is the cell of point i, ``keys`` (n,) are the cells of all
+    points, sorted; the other parameters are as in `_smooth`.
     """
     n = 0
     for side in range(9):
@@ -153,9 +154,10 @@ def _neighbours(
 
 @kernel(inline=True)
 def _plane(offsets: F8, n: int) -> tuple[F8, float]:
-    """Return the normal (3,) of the plane fitted to weighted points, and the plane's height over 0.
+    """Return the plane fitted to weighted points: normal (3,), and height above the origin, radii.
 
-    The points are the first ``n`` rows of ``offsets``, from `_neighbours`.
+    The height is along the normal. The points are the first ``n`` rows of ``offsets``, from
+    `_neighbours`.
     """
     mean, spread = np.zeros(3), np.zeros((3, 3))
     total = 0.0
@@ -207,7 +209,8 @@ def _least_direction(spread: F8) -> F8:
 def _quadric(offsets: F8, n: int, normal: F8, height: float) -> float:
     """Return the height of the fitted quadric over the plane, at the projection of the origin.
 
-    ``normal`` and ``height`` are from `_plane`, the other parameters as there.
+    The result is in radii. ``normal`` and ``height`` are from `_plane`, the other parameters as
+    there.
     """
     small = 0
     for axis in range(1, 3):

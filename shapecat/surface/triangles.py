@@ -37,7 +37,7 @@ def triangles_of(edges: U2, nodes: int) -> U2:
 def _walk(edges: U2, begin: I4, result: U2) -> int:
     """Write the triangles to ``result`` (m, 3) while there is room; return their total number.
 
-    ``edges`` are as in `triangles_of`; in them, those with first node i begin at ``begin[i]``.
+    ``edges`` are as in `triangles_of`; ``begin[i]`` is the row of the first edge with first node i.
     """
     n = 0
     for edge in range(len(edges)):

@@ -8,8 +8,8 @@ from shapecat.jit import kernel
 __all__ = ["read_only", "voxelize"]
 
 _FRACTION_BITS = 16
-"""Coordinates are summed as integers, in units of 2**-16 voxels, so that their order does not
-matter."""
+"""Coordinates are summed as integers, in units of 2**-16 voxels, so that the order of the points
+does not matter."""
 _RADIX_BITS = 11
 _LARGEST = np.int64(1 << 62)
 
