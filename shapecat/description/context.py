@@ -57,7 +57,7 @@ _DIRECTIONS = 16
 
 @kernel(inner=True)
 def _ratio(a: float, b: float) -> float:
-    """Return a / (a + b), which maps a ratio of lengths to 0 to 1; 0.5 if both are 0."""
+    """Return a / (a + b), from 0 to 1, for lengths a and b; 0.5 if both are 0."""
     return a / (a + b) if a + b > 0 else 0.5
 
 
@@ -144,11 +144,10 @@ def context(
 
 @kernel(inline=True)
 def _extents(points: F4, height: float, eye: F4, out: F4) -> tuple[float, float, float]:
-    """Compare the height with horizontal widths; return three widths.
+    """Write ratios of the height and of horizontal widths to ``out`` (5,); return three widths.
 
     They are the largest width, and the widths across and along the line of sight. ``points`` (3, n)
-    and ``eye`` (3,) are as in `Surface`; ``height`` is that of the points. Ratios go to ``out``
-    (5,).
+    and ``eye`` (3,) are as in `Surface`; ``height`` is that of the points.
     """
     ex, ey = eye[0], eye[1]
     length = np.sqrt(ex * ex + ey * ey)
@@ -200,9 +199,10 @@ def _spreads(x: F4, y: F4, z: F4, weight: F4, normals: F4, out: F4) -> None:
 
 @kernel(inline=True)
 def _harmonics(weight: F4, normals: F4, out: F4) -> None:
-    """Write harmonics of the distribution of the normals over yaw; the fourth is high for boxes.
+    """Write the magnitudes of harmonics 1, 2 and 4 of the normals' distribution over yaw.
 
-    ``weight`` (k,) and ``normals`` (3, k) are as in `_spreads`; ``out`` is (3,).
+    Harmonic 4 is high for boxes. ``weight`` (k,) and ``normals`` (3, k) are as in `_spreads`;
+    ``out`` is (3,).
     """
     total = 1e-6
     c, s = np.zeros(3), np.zeros(3)
@@ -225,11 +225,11 @@ def _harmonics(weight: F4, normals: F4, out: F4) -> None:
 
 @kernel(inline=True)
 def _facing(rise: F8, weight: F4, normals: F4, out: F4) -> None:
-    """Write the fractions of the surface that face up, sideways and down.
+    """Write to ``out`` (5,) the fractions of the surface that face up, sideways and down.
 
-    Then follow the fractions that face up near the top and near the bottom. ``rise`` (k,) is the
-    height of each neuron, 0 at the bottom and 1 at the top; ``weight`` and ``normals`` are as in
-    `_spreads`; ``out`` is (5,).
+    They are followed by the fractions that face up near the top and near the bottom. ``rise`` (k,)
+    is the height of each neuron, about 0 at the bottom and 1 at the top; ``weight`` and ``normals``
+    are as in `_spreads`.
     """
     for i in range(rise.size):
         w, up = weight[i], normals[2, i]
@@ -253,8 +253,8 @@ def _axis(
 ) -> None:
     """Compare the surface with a surface of revolution about an upright axis.
 
-    ``rise`` is as in `_facing`, ``height`` is that of the object; the other parameters are as in
-    `_spreads`. Writes to ``out`` (9,).
+    ``upright`` is from `vertical_axis`, ``rise`` is as in `_facing`, ``height`` is that of the
+    object; the other parameters are as in `_spreads`. Writes the nine ``axis`` features to ``out``.
     """
     cx, cy, residual = upright
     radius = radius2 = middle = 0.0
@@ -288,9 +288,10 @@ def _axis(
 
 @kernel(inline=True)
 def _heights(rise: F8, weight: F4, curvatures: F4, out: F4) -> None:
-    """Write mean, deviation and skew of heights ``rise`` (n,), and the share of convex surface.
+    """Write mean, deviation and skew of the heights, and the convex fraction of the surface.
 
-    ``weight`` (k,) is as in `_sphere`, ``curvatures`` (2, k) from `fit_surfaces`; ``out`` is (4,).
+    ``rise`` (k,) is as in `_facing`, ``weight`` (k,) as in `_sphere`; ``curvatures`` (2, k) is from
+    `fit_surfaces`; ``out`` is (4,).
     """
     mean = second = third = 0.0
     for i in range(rise.size):

@@ -79,7 +79,8 @@ def fit_surfaces(
 
     Parameters
     ----------
-    points, starts : (3, n) points sorted by neuron, and (k + 1,) where each begins, from `assign`.
+    points, starts : (3, n) points sorted by neuron, and (k + 1,) the index at which the points of
+        each neuron begin, from `assign`.
     x, y, z : (k,) positions of the neurons.
     euclidean : (k, k) Euclidean distances between the neurons.
     radius : radius of the neighbourhoods, in the unit of the positions.
@@ -137,9 +138,11 @@ def fit_surfaces(
 def _normal(
     u: F4, v: F4, w: F4, n_points: int, ex: float, ey: float, ez: float
 ) -> tuple[float, float, float]:
-    """Return the direction of smallest variance; if that is undefined, (ex, ey, ez) normalised.
+    """Return the unit direction of smallest variance of the points; its sign is arbitrary.
 
-    ``u``, ``v``, ``w`` (n,) hold the offsets of ``n_points`` points from the neuron, in radii.
+    If it is undefined, return the direction to the sensor, (ex, ey, ez); if the points are on a
+    line, its part perpendicular to the line. The first ``n_points`` elements of ``u``, ``v`` and
+    ``w`` are the offsets of the points from the neuron, in radii.
     """
     su = sv = sw = suu = suv = suw = svv = svw = sww = np.float32(0)
     for k in range(n_points):
@@ -204,12 +207,12 @@ def _normal(
 def _quadric(
     u: F4, v: F4, w: F4, n_points: int, a: float, b: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the principal curvatures (largest first) and the normal at the origin.
+    """Return both principal curvatures, largest first, and the normal (x, y, z), at the neuron.
 
-    Curvature is positive where the surface bends away from the normal (a, b, c), which is from
-    `_normal`, as ``u``, ``v``, ``w`` and ``n_points`` are there.
+    Curvatures are in 1 / radii, from -4 to 4, and positive where the surface bends away from the
+    normal. (a, b, c) is the normal from `_normal`; the other parameters are as there.
     """
-    # Tangents without a branch on the direction (Duff et al. 2017).
+    # Tangent vectors without a branch on the direction (Duff et al. 2017).
     sign = 1.0 if c >= 0 else -1.0
     d = -1.0 / (sign + c)
     e = a * b * d

@@ -26,7 +26,8 @@ _GRID_SPACING = 1.15
 _RADIUS = 2.2 * _GRID_SPACING
 """Radius of the neighbourhoods in which curvature is fitted, in mean gaps between neurons."""
 _REACH = 3 * _GRID_SPACING
-"""Points farther than this from every neuron are ignored, in mean gaps between neurons."""
+"""Maximum distance of a point from its nearest neuron, in mean gaps between neurons; farther points
+are ignored."""
 _FAR = 1e6
 
 
@@ -88,8 +89,9 @@ def describe(points: F4, gas: NeuralGas, eye: F4) -> F4:
 def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> None:
     """Write the descriptor to ``out`` (d,).
 
-    The other parameters are the arrays of `describe` and of its graph. Each block is a kernel of
-    its own: as one they would take two seconds more to compile.
+    ``points`` and ``eye`` are as in `describe`; ``neurons`` (k, 3) and ``edges`` (e, 2) are the
+    graph of the points. Each block is a kernel of its own: a single kernel would take two seconds
+    more to compile.
     """
     surface = _prepare(points, neurons, edges, eye)
     cloud, weight, unit = surface.points, surface.weight, surface.unit
@@ -128,7 +130,7 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> None:
 
 @kernel
 def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> Surface:
-    """Return the object in its own units; the parameters are as in `_describe`."""
+    """Return the object as a `Surface`; the parameters are as in `_describe`."""
     rows, euclidean, center, unit = _own_units(neurons)
     x, y, z = rows[0], rows[1], rows[2]
     away = 0.0
@@ -168,9 +170,9 @@ def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> Surface:
 
 @kernel(inline=True)
 def _cloud_of(points: F4, center: F8, unit: float) -> F4:
-    """Return every k-th point (3, n), relative to ``center`` and in units of ``unit``.
+    """Return at most `_MAX_POINTS` points (3, n), relative to ``center``, in units of ``unit``.
 
-    ``points`` (m, 3) and ``center`` (3,) are in metres.
+    ``points`` (m, 3), ``center`` (3,) and ``unit`` are in metres.
     """
     step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
     total = (points.shape[0] + step - 1) // step

@@ -63,8 +63,8 @@ def _less(a: float, b: float) -> float:
 def _ways(paths: F4, k: int, via: F4) -> None:
     """Write the path lengths from each of the nodes k to k + 3 to ``via``.
 
-    ``paths`` (n, n) are the lengths so far, ``via`` is (4, n). A path may pass through those of the
-    four nodes that have lower numbers.
+    ``paths`` (n, n) are the lengths so far, ``via`` is (4, n). A path from node k + m may pass
+    through the nodes k to k + m - 1.
     """
     first, second, third, fourth = paths[k], paths[k + 1], paths[k + 2], paths[k + 3]
     a = second[k]
@@ -102,10 +102,10 @@ def _shorten(paths: F4, i: int, via: F4, k: int) -> None:
 
 @kernel(fast=True, inline=True)
 def _joined(paths: F4, euclidean: F4) -> F4:
-    """Return the paths (n, n) without padding, and fill in those that do not exist.
+    """Return the path lengths (n, n) without padding.
 
-    Their length is that of the longest path plus the distance of the two nodes. ``euclidean`` (n,
-    n) are the distances of the nodes.
+    Two nodes without a path get their Euclidean distance, from ``euclidean`` (n, n), plus the
+    length of the longest path.
     """
     count = euclidean.shape[0]
     result = np.zeros((count, count), np.float32)

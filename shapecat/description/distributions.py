@@ -46,10 +46,10 @@ def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
 
 @kernel(inner=True)
 def _find_bins(lengths: F4, i: int, scale: float, one: float, bins: I4, shares: F4) -> None:
-    """Write, for each length in row i, the first of its two bins, and the share of the second.
+    """Split each length in row i between the two nearest bins of a histogram.
 
-    The two shares of a length add up to ``one``; ``scale`` is bins per unit of length. ``lengths``
-    is (n, n); ``bins`` and ``shares`` (n,) are written.
+    Writes the first bin of each to ``bins`` (n,), and the weight of the second to ``shares`` (n,);
+    both weights add up to ``one``. ``lengths`` is (n, n), ``scale`` is bins per unit of length.
     """
     last = np.float32(DISTANCE_BINS - 1)
     for j in range(lengths.shape[1]):
@@ -147,9 +147,9 @@ def _partition(
 
     ``rows`` (n, k) are a 1 and the histograms of each neuron. The intervals divide the range of
     ``order`` (n,); ``weight`` (n,) is each neuron's fraction of the points. The blocks of geodesic
-    distances, Euclidean distances and curvature begin at the three last indices in the descriptor
-    ``out``. A neuron counts in the two intervals whose middles are nearest, so that a small change
-    of the graph changes the descriptor little.
+    distances, Euclidean distances and curvature begin at ``at_geodesic``, ``at_euclidean`` and
+    ``at_curvature`` in the descriptor ``out``. A neuron counts in the two intervals whose middles
+    are nearest, so that a small change of the graph changes the descriptor little.
     """
     low, high = outer_range(order)
     sums = np.zeros((parts, rows.shape[1]))

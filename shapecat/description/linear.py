@@ -18,9 +18,10 @@ suffice."""
 
 @kernel(inner=True)
 def solve(A: F8, b: F8) -> None:
-    """Solve A x = b in place for a symmetric positive semidefinite matrix (n, n): b becomes x.
+    """Solve A x = b for a symmetric positive semidefinite matrix ``A`` (n, n).
 
-    The method is Gaussian elimination. An unknown that the equations do not determine becomes 0.
+    ``b`` (n,) becomes x; ``A`` is overwritten. The method is Gaussian elimination. An unknown that
+    the equations do not determine becomes 0.
     """
     size = b.size
     for k in range(size):

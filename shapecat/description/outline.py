@@ -39,7 +39,7 @@ def outline(cloud: F4, eye: F4, out: F4) -> None:
     ----------
     cloud : (3, n) points, z up, in units of the mean distance between neurons.
     eye : (3,) position of the sensor in the same frame.
-    out : the block ``outline``, written in place.
+    out : the block ``outline``, zeros, written in place; slices without points stay 0.
     """
     across, upward = _image(cloud, eye)
     out[_END], out[_END + 3] = _widths(upward, across, _UPRIGHT, out[:_LONG])
@@ -61,9 +61,10 @@ def outline(cloud: F4, eye: F4, out: F4) -> None:
 
 @kernel(inline=True)
 def _image(cloud: F4, eye: F4) -> tuple[F4, F4]:
-    """Return the image coordinates (n,) of the points: to the right, and upwards.
+    """Project the points onto the plane through the origin that faces the sensor.
 
-    ``cloud`` (3, n) and ``eye`` (3,) are as in `outline`.
+    Returns their coordinates (n,) to the right and (n,) upwards. ``cloud`` (3, n) and ``eye`` (3,)
+    are as in `outline`.
     """
     count = cloud.shape[1]
     across, upward = np.zeros(count, np.float32), np.zeros(count, np.float32)
@@ -89,9 +90,9 @@ def _widths(
 ) -> tuple[float, float]:
     """Write width and offset of each slice to ``out``, relative to the largest width.
 
-    ``along`` and ``across`` (n,) are coordinates of the points; slices divide ``along``. With
-    ``to_narrow``, they go from the wide to the narrow end. Returns length / (length + largest
-    width), and the mean width divided by the largest.
+    ``along`` and ``across`` (n,) are coordinates of the points; the slices divide the range of
+    ``along``. With ``to_narrow``, the slices go from the wide to the narrow end. Returns length /
+    (length + largest width), and the mean width divided by the largest.
     """
     low, high = inner_range(along)
     length = max(high - low, 1e-6)

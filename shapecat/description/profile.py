@@ -35,9 +35,8 @@ def vertical_axis(x: F4, y: F4, normals: F4, weight: F4) -> VerticalAxis:
     """Find the vertical axis that the normals of a surface point to or away from.
 
     It is the vertical line nearest to the horizontal lines that pass through the neurons in the
-    horizontal direction of their normals.
-
-    A weak prior at the origin makes the result unique even if all normals are parallel or vertical.
+    horizontal direction of their normals. A weak prior at the origin makes the result unique even
+    if all normals are parallel or vertical.
 
     Parameters
     ----------

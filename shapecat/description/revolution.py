@@ -119,11 +119,11 @@ def _place(
 ) -> tuple[F8, F8]:
     """Return cylindrical coordinates (5, n) about the axis, and the range (2,) along it.
 
-    ``owner`` (n,) is the neuron of each point of ``cloud`` (3, n), ``normals`` (3, k) are those of
-    the neurons. The axis has the direction ``axis`` and contains ``point``; ``first`` and
-    ``second`` are from `_across`. The rows are the position along the axis, the radius, the radial
-    unit vector (2), and a weight, the fourth power of the sine of the angle between normal and
-    axis.
+    The rows of the coordinates are the position along the axis, the radius, two components (along
+    ``first`` and ``second``, from `_across`) of the radial unit vector, and a weight, the fourth
+    power of the sine of the angle between normal and axis. ``owner`` (n,) is the neuron of each
+    point of ``cloud`` (3, n), ``normals`` (3, k) are those of the neurons. The axis has the unit
+    direction ``axis`` and contains ``point``.
     """
     rows = np.zeros((5, cloud.shape[1]))
     extent = np.zeros(2)

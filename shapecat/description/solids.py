@@ -79,9 +79,9 @@ def _log_ratio(a: float, b: float) -> float:
 def _box_frame(cloud: F4, x: F4, y: F4, normals: F4, eye: F4) -> tuple[F4, F4]:
     """Return the points' coordinates (n,) along both horizontal axes of the best upright box.
 
-    Both axes point towards the sensor. The parameters are as in `solids`. The fit minimises the
-    distance from vertical surface to the nearer of the two visible walls (Zhang et al. 2017,
-    "L-shape fitting", the closeness criterion).
+    Both axes point towards the sensor. The parameters are as in `solids`. The fit minimises the sum
+    of the neurons' distances from the nearer of the two visible walls, weighted by how vertical the
+    surface is (Zhang et al. 2017, "L-shape fitting", the closeness criterion).
     """
     u, v = np.zeros(x.size, np.float32), np.zeros(x.size, np.float32)
     start = np.arctan2(eye[1], eye[0])  # so that the result turns with the scene
