@@ -28,7 +28,8 @@ class BoostedEnsemble(NamedTuple):
 
     Attributes
     ----------
-    leaf_values : (l, k) the value that each leaf adds to each logit, rounded to half precision.
+    leaf_values : (l, k) the value that each of l leaves adds to each of k logits, rounded to half
+        precision.
     bias : (k,) constants of the logits.
     """
 
@@ -47,15 +48,15 @@ def grow_ensemble(
     jobs: int,
     rng: np.random.Generator,
 ) -> BoostedEnsemble:
-    """Grow gradient-boosted trees; a logit is the sum of the values of a view's leaves.
+    """Grow gradient-boosted trees; a logit is a bias plus the values of the leaves a view reaches.
 
-    Each round grows one tree per category against the rest, on the residual of the category's
-    posterior. Thus the trees and the classifiers, which sum the leaf values, are learned together.
+    Each round grows one tree for each category, on the residual of its posterior. Thus the trees
+    and the classifiers, which sum the leaf values, are learned together.
 
     Parameters
     ----------
     features : (n, f).
-    labels : (n,) index of the logit that is true for each view.
+    labels : (n,) index of each view's true logit; each logit is true for at least one view.
     rounds : trees per category.
     leaves : maximum number of leaves per tree.
     rate : learning rate.

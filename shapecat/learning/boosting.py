@@ -28,8 +28,8 @@ class TreeSettings(NamedTuple):
     ----------
     leaves : maximum number of leaves.
     rate : learning rate, which multiplies every leaf value.
-    l2 : L2 regularisation, added to the second derivative of a leaf.
-    min_hessian : minimum second derivative of a leaf.
+    l2 : L2 regularisation, added to the sum of the second derivatives in a leaf.
+    min_hessian : minimum sum of the second derivatives in a leaf.
     """
 
     leaves: int
@@ -56,7 +56,8 @@ class Tree(NamedTuple):
 
     Attributes
     ----------
-    feature, threshold : (m,) a view goes to the left child if its feature is <= threshold.
+    feature, threshold : (m,) a view goes to the left child if this feature is <= this threshold;
+        meaningless for leaves.
     left : (m,) index of the left child, 0 for a leaf; the right child follows the left one.
     value : (m,) value that a leaf adds to the score.
     """
@@ -172,9 +173,9 @@ def _grow(
 
 @kernel(inner=True)
 def _collect(binned: U1, columns: I4, rows: I4, gradient: F4, hessian: F4, sums: F4) -> None:
-    """Add the gradient and hessian of the views in ``rows`` to ``sums`` (columns, BINS, 2).
+    """Add the derivatives of the views in ``rows`` to ``sums`` (columns, BINS, 2), bin by bin.
 
-    The parameters are as for `_grow`.
+    The last axis is gradient, hessian; the parameters are as for `_grow`.
     """
     g, h = gradient[rows], hessian[rows]
     for c in range(columns.size):
@@ -187,10 +188,10 @@ def _collect(binned: U1, columns: I4, rows: I4, gradient: F4, hessian: F4, sums:
 
 @kernel(inner=True)
 def _best_cut(sums: F4, l2: float, min_hessian: float, best: F8) -> float:
-    """Write gain, column and bin of a leaf's best split into ``best`` (3,).
+    """Write gain, column and last left bin of a leaf's best split to ``best`` (3,).
 
-    Returns the Newton step of the leaf. ``sums`` are from `_collect`; the other parameters are as
-    in `TreeSettings`.
+    The gain is 0 if there is no split; the column is an index into ``sums``, from `_collect`. The
+    other parameters are as in `TreeSettings`. Returns the negative Newton step of the leaf.
     """
     gradient = hessian = 0.0
     for k in range(BINS):
@@ -222,8 +223,8 @@ def _best_cut(sums: F4, l2: float, min_hessian: float, best: F8) -> float:
 def _divide(bins: U1, rows: I4, first: int, last: int, cut: int, spare: I4) -> int:
     """Move the views with bins <= ``cut`` to the front of rows[first:last], keeping their order.
 
-    ``bins`` (n,) are the bins of all views in one feature. Returns the index in ``rows`` (n,) of
-    the first other view; ``spare`` (n,) is work space.
+    ``bins`` (n,) are the bins of all views in one feature. Returns the index in ``rows`` of the
+    first view that is not moved; ``spare`` is work space of the size of ``rows``.
     """
     low, high = first, 0
     for i in range(first, last):

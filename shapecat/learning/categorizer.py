@@ -169,7 +169,10 @@ class Categorizer(Record):
 
 
 def parts_of(record: Record, prefix: str = "") -> dict[str, Any]:
-    """Return the fields of nested records, which are arrays or plain values, by dotted name."""
+    """Return the arrays and plain values in a record and in its records, by dotted name.
+
+    Each name begins with ``prefix``.
+    """
     parts: dict[str, Any] = {}
     for item in fields(record):  # type: ignore[arg-type]  # every Record is a dataclass
         value = getattr(record, item.name)

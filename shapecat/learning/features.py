@@ -15,8 +15,8 @@ class Standardisation(Record):
 
     Attributes
     ----------
-    mean, inverse_scale : (d,) mean of each component, and the inverse of its standard deviation;
-        0 for a constant component.
+    mean, inverse_scale : (d,) mean of each component, and 1 / its standard deviation, or 0 if the
+        component is constant.
 
     Raises
     ------

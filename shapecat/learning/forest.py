@@ -83,7 +83,8 @@ class FlatForest(Record):
 def apply(x: F4, trees: Trees, leaf_id: I4, result: I4) -> None:
     """Write the id of the leaf that one view reaches in each tree into ``result`` (t,).
 
-    ``x`` (f,) are its features; ``leaf_id`` (n,) is from `FlatForest.leaf_id`.
+    ``x`` (f,) are the features of the view; ``trees`` and ``leaf_id`` (n,) are from
+    `FlatForest.parameters`.
     """
     leaves, (roots, feature, threshold, left) = np.zeros(LANES, np.int32), trees
     for first in range(0, result.size, LANES):

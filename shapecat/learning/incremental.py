@@ -1,4 +1,4 @@
-"""Adding categories to fixed trees without relearning the old ones (thesis 7.5.3)."""
+"""Adding categories to a model without changing its trees or its old categories (thesis 7.5.3)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,7 +22,7 @@ _FOLDS = 4
 _STEPS = 150
 """Maximum number of iterations of the minimiser if it starts from zero weights."""
 _FEW_STEPS = 40
-"""Maximum number of iterations if it starts from the weights for all views, as for each fold."""
+"""Maximum number of iterations if it starts from weights fitted to all views, as for each fold."""
 _LOST = 0.006
 """Fraction of the correctly categorized known views that new categories may take over."""
 _LARGEST_SHIFT = 2.0
@@ -69,7 +69,7 @@ def add_categories(
 
     Raises
     ------
-    ValueError : there is no new category.
+    ValueError : there is no new category, or a new name is invalid, or there are too many.
     ModelError : the model holds no known views.
 
     Notes
@@ -201,8 +201,9 @@ def _shift(
     """Return the largest constant that can be added to the new logits with little harm.
 
     With it, the new categories take over at most a fraction `_LOST` of the views that the old
-    logits categorize correctly. The new logits of a view come from a fold without this view. The
-    parameters are as for `_fit_new`; ``learned`` are the weights that it returned for all views.
+    logits categorize correctly. It is from 0 to `_LARGEST_SHIFT`. The new logits of a view come
+    from a fit without the view. The parameters are as for `_fit_new`; ``learned`` are the weights
+    that it returned for all views.
     """
     fold = rng.permutation(len(truth)) % _FOLDS
     new = np.zeros((len(truth), learned.shape[1]))

@@ -200,7 +200,10 @@ def _parse_array(data: bytes) -> np.ndarray:
 
 
 def _assemble(kind: type[_Record], parts: Mapping[str, Any], prefix: str) -> _Record:
-    """Build a record from its fields by dotted name; the inverse of `parts_of`."""
+    """Build a record from its fields by dotted name, each beginning with ``prefix``.
+
+    This is the inverse of `parts_of`. Parts that the record does not have are ignored.
+    """
     values: dict[str, Any] = {}
     hints = get_type_hints(kind)
     for item in fields(kind):  # type: ignore[arg-type]  # every Record is a dataclass

@@ -74,7 +74,7 @@ def fit_categorizer(
 
     Parameters
     ----------
-    train : training views.
+    train : training views; those with a label that is no category are learned as unknown shapes.
     held_out : views of other instances, for fitting the temperature and the novelty threshold.
     descriptor_names : names of the components of the descriptor.
     categories : the categories in the order of the posterior.
@@ -154,7 +154,7 @@ def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) 
 def fit_threshold(categorizer: Categorizer, held_out: Examples, *, rejected: float) -> Categorizer:
     """Set the novelty threshold so that it rejects a given fraction of the held-out views.
 
-    The parameters are as for `calibrate`.
+    The parameters are as for `calibrate`; the temperature does not change.
     """
     views = held_out.descriptors[encode(held_out.labels, categorizer.categories) >= 0]
     if not len(views):
