@@ -89,7 +89,8 @@ class Densities:
     def log_densities(self, x: F4) -> F8:
         """Return the log densities (n, categories, blocks) of descriptors (n, d).
 
-        In each block, those of views under their own category have mean 0 and standard deviation 1.
+        They are standardised, so that in each block training views have mean 0 and standard
+        deviation 1 under their own category, and then clipped.
         """
         z = self.standardise(x)
         densities = [

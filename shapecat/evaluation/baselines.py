@@ -86,7 +86,7 @@ def _folds(views: DescribedViews) -> Iterator[tuple[DescribedViews, DescribedVie
 
 
 def _mean_views(splits: list[tuple[DescribedViews, DescribedViews]], *, with_unknown: bool) -> int:
-    """Return the mean number of training views over the splits, with or without unknown shapes."""
+    """Return the mean number of training views of a split, with or without unknown shapes."""
     counts = [np.sum(with_unknown | (train.labels != UNKNOWN)) for train, _ in splits]
     return round(float(np.mean(counts)))
 
@@ -158,7 +158,10 @@ def _learn_shapecat(train: DescribedViews, test: DescribedViews, categories: tup
 
 
 def _make_learner(make: Callable[[], Any], features: Callable[[DescribedViews], F4]) -> _Learner:
-    """Return a learner: a scikit-learn classifier on features, trained without unknown shapes."""
+    """Return a learner that trains a scikit-learn classifier, without the unknown shapes.
+
+    ``make`` returns the untrained classifier; ``features`` returns its inputs (n, f) for views.
+    """
 
     def learn(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
         known = train.where(train.labels != UNKNOWN)
@@ -182,5 +185,5 @@ def _in_order(posteriors: F4, found: Any, categories: tuple[str, ...]) -> F8:
 
 
 def _d2(views: DescribedViews) -> F4:
-    """Return the distributions (n, d) of point distances, the first third of all functions."""
+    """Return the histograms (n, d) of point distances (D2), the first third of ``functions``."""
     return views.functions[:, : views.functions.shape[1] // 3]

@@ -103,7 +103,7 @@ def _content(path: Path) -> bytes:
 
 
 def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], _Layout]:
-    """Return the words of each line of a header, by the first word, and the body's layout."""
+    """Return the other words of each header line by its first word, and the body's layout."""
     found = re.search(rb"^DATA +(\w+)\s*?\n", content[:_LARGEST_HEADER], re.MULTILINE)
     if not found:
         msg = "it has no line DATA"
@@ -131,7 +131,7 @@ def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], _Layout]:
 
 
 def _ply_header(content: bytes) -> tuple[F8 | None, _Layout]:
-    """Return the words of the comment VIEWPOINT as numbers, None without it, and the layout."""
+    """Return the position in the comment VIEWPOINT (None without it), and the body's layout."""
     end = re.search(rb"^end_header\r?\n", content[:_LARGEST_HEADER], re.MULTILINE)
     if not content.startswith(b"ply") or not end:
         msg = "it has no header"

@@ -30,7 +30,7 @@ DAMAGED = (
     TypeError,  # the content of an .npy file
     MemoryError,  # a header that claims too many points
     RuntimeError,  # encrypted, or an unknown compression
-    SyntaxError,  # the header of an .npy file, as is the next
+    SyntaxError,  # this and the next: the header of an .npy file
     tokenize.TokenError,
     zipfile.BadZipFile,
     zlib.error,
@@ -55,7 +55,7 @@ class View(Record):
 class Dataset:
     """The files of a data set; views are read on demand.
 
-    ``without_views`` names the folders beside the categories that hold no view.
+    ``without_views`` names the folders, beside those of the categories, in which there is no view.
     """
 
     files: tuple[Path, ...]
@@ -80,8 +80,8 @@ def read_dataset(root: Path) -> Dataset:
 
     Raises
     ------
-    RecordingError : the folder holds no views, or the views of a category are not in folders of
-        objects, but beside or below them.
+    RecordingError : the folder holds no views, or all views of a category are beside or below the
+        folders of its objects, not in them.
     """
     files = tuple(_views_among(root, "*/*/*"))
     if not files:
@@ -105,7 +105,7 @@ def read_dataset(root: Path) -> Dataset:
 
 
 def _views_among(root: Path, pattern: str) -> list[Path]:
-    """Return the sorted paths of the views below a folder; hidden ones are left out."""
+    """Return the sorted paths of the views below a folder that match a glob; omit hidden ones."""
     return sorted(
         path
         for path in root.glob(pattern)

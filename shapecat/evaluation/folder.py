@@ -31,8 +31,9 @@ def evaluate_folder(
     ----------
     root : folder of the data set.
     model : model file; the default model by default.
-    baselines : folder of a data set on which shapecat's classifier and baselines are trained, to be
-        tested on ``root``. If it is ``root`` itself, use cross-validation by instance.
+    baselines : folder of a data set on which shapecat's classifier and the baselines are trained,
+        to be tested on ``root``. If it is ``root`` itself, they are cross-validated by instance.
+        None for no baselines.
 
     Raises
     ------
@@ -65,11 +66,13 @@ def evaluate_folder(
 
 
 def _require_other_views(test: Dataset, root: Path, training_set: Path) -> None:
-    """Check that a training set holds none of the views that are tested.
+    """Check that no tested view is also in a training set, at the same path below its folder.
+
+    ``root`` is the folder of ``test``, ``training_set`` that of the training set.
 
     Raises
     ------
-    RecordingError : it holds one.
+    RecordingError : a view is.
     """
     for path in test.files:
         other = training_set / path.relative_to(root)

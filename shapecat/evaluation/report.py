@@ -188,7 +188,7 @@ def require_categories(names: Sequence[str], categorizer: Categorizer) -> None:
 
 
 def _novelty_figures(unknown: F4, known: F4) -> dict[str, float | None]:
-    """Return AUROC, and the fraction of unknown views rejected, from novelties (n,) and (m,)."""
+    """Return `Report.novelty` from the novelties of unknown (n,) and of known views (m,)."""
     return {
         "n": len(unknown),
         "auroc": _defined(metrics.auroc(unknown, known)),
@@ -199,7 +199,8 @@ def _novelty_figures(unknown: F4, known: F4) -> dict[str, float | None]:
 def _accuracy_over(values: np.ndarray, right: I4, edges: Sequence[float], unit: str) -> Ranges:
     """Return (range, views, accuracy) for each range between ``edges`` that has views.
 
-    ``values`` (n,) and ``right`` (n,), whether the label is right, are those of the views.
+    ``values`` (n,) is the quantity of each view, in ``unit``; ``right`` (n,) is whether its
+    category is right.
     """
     rows = []
     for low, high in itertools.pairwise(edges):

@@ -97,12 +97,12 @@ def learn_on_folder(
     Returns
     -------
     Plain values as for `train_on_folder`, with ``added`` (the new categories), but without
-    calibration.
+    ``calibrated`` and ``held_out``.
 
     Raises
     ------
-    RecordingError : there are no views, one cannot be read, a folder has an invalid name, or all
-        views of the new categories have too few points, or there are none.
+    RecordingError : there are no views, one cannot be read, a folder has an invalid name, or no
+        view of a new category has enough points.
     ModelError : the model is unusable, or there is no new category, or there are too many.
     OutputError : the result cannot be written.
     """
@@ -168,7 +168,7 @@ def _describe_folder(
 ) -> tuple[DescribedViews, list[str]]:
     """Describe a data set from which a model with the ``known`` categories will learn.
 
-    Return the described views, and the names of the folders that have none.
+    Return the described views, and the sorted names of the category folders without any.
     """
     dataset = read_dataset(root)
     require_category_names(root, dataset.categories, known)

@@ -18,7 +18,7 @@ __all__ = ["DescribedViews", "describe_view", "describe_views"]
 
 _NOT_ASKED = np.zeros(0)
 _NEAR_SUPPORT_M = 0.05
-"""Maximum distance from z = 0 of the lowest visible point of an object that stands there."""
+"""Maximum distance from z = 0 of the lowest visible point of an object that stands at z = 0."""
 
 
 class DescribedViews(NamedTuple):
@@ -27,7 +27,7 @@ class DescribedViews(NamedTuple):
     Attributes
     ----------
     descriptors : (n, d).
-    labels, instances : (n,) names of categories and of instances.
+    labels, instances : (n,) names of the categories, and of the instances as category/instance.
     points : (n,) number of voxels.
     distances : (n,) distance from the sensor, metres.
     skipped : number of views with too few points for a surface, which are left out.

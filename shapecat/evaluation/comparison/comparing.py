@@ -166,7 +166,7 @@ def _hardly_matches(rows: Sequence[Difference]) -> bool:
 
 
 def _categories_left_out(tally: Tally, categories: Sequence[str]) -> list[str]:
-    """Return a note if matched objects have a true category that the model does not know."""
+    """Return a list with a note if the model lacks the true category of any matched object."""
     others = [pair.truth for pair in tally.pairs if pair.truth not in (*categories, UNKNOWN)]
     if not others:
         return []
@@ -178,7 +178,11 @@ def _categories_left_out(tally: Tally, categories: Sequence[str]) -> list[str]:
 def _clouds(
     finished: FinishedRun, recording: Path | None, stack: ExitStack
 ) -> tuple[Iterator[Frame], list[str]]:
-    """Return the frames of the recording, and no notes; if it is missing, no frames and a note."""
+    """Return the frames of the recording, opened in ``stack``, and an empty list.
+
+    If it cannot be opened, return no frames and a list with a note; but if ``recording`` says where
+    it is, raise the error.
+    """
     try:
         source = stack.enter_context(open_source(finished.info, recording))
         options: Options = {**finished.info["options"], "color": ""}
@@ -201,8 +205,8 @@ def _compare_frame(
     """Match the objects of a frame, and count agreements and differences in ``tally``.
 
     ``row`` is the frame's row in the table of the run; ``clouds`` yields the frames of the
-    recording. Keep a picture of the frame if it differs most of all frames in its ``part`` of the
-    run.
+    recording. Keep a picture of the frame if it differs more than all earlier frames in its part of
+    the run, number ``part``.
     """
     frame = next((f for f in clouds if (f.topic, f.index) == key), None)
     _require_same_size(found, true, frame, key)

@@ -23,7 +23,10 @@ __all__ = ["Tally", "figures_of"]
 
 
 class Pair(NamedTuple):
-    """Categories of a matched pair: the true one, the final one, and that of the view alone."""
+    """Categories of a matched pair: the true one, the final one, and that of the view alone.
+
+    ``posterior`` (c,) is from the view alone, too.
+    """
 
     truth: str
     label: str
@@ -101,7 +104,10 @@ def figures_of(tally: Tally, categories: Sequence[str], *, tracked: bool) -> dic
 
 
 def _objects(rows: Sequence[Difference], overlap: Overlap | None) -> dict[str, Any]:
-    """Count true and found objects, matched by masks, or by boxes if there are no masks."""
+    """Count true objects, detections and found objects.
+
+    True objects are found by overlap F, or by their boxes if ``overlap`` is None.
+    """
     true = sum(row.difference != "surplus" for row in rows)
     detections = sum(row.difference != "missed" for row in rows)
     hits = overlap.hits if overlap else sum(r.difference not in {"surplus", "missed"} for r in rows)
@@ -133,7 +139,7 @@ def _accuracy(pairs: Sequence[tuple[str, str]]) -> float | None:
 
 
 def _balanced(pairs: Sequence[tuple[str, str]]) -> float | None:
-    """Return the mean recall over the categories."""
+    """Return the mean recall of the true categories; a pair is the true and the given category."""
     names = sorted({true for true, _ in pairs})
     recalls = [_accuracy([pair for pair in pairs if pair[0] == name]) for name in names]
     return _mean([value for value in recalls if value is not None])

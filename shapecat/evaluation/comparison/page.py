@@ -54,7 +54,7 @@ OBJECTS = pa.schema(
 
 
 def require_new(folder: Path) -> None:
-    """Check, before the work begins, that a folder is new or empty.
+    """Check that a folder is new or empty, and create its parent, before the work begins.
 
     Raises
     ------

@@ -22,8 +22,8 @@ COLOURS = {
     "surplus": (30, 100, 220),
     "category": (160, 40, 170),
 }
-"""Colours of pixels: on which run and truth agree, only in the truth, only in the run, and in both
-but with different categories."""
+"""Colours of the pixels of objects: the same in run and truth, only in the truth, only in the run,
+and in both but with different categories."""
 _INK = 0.55
 
 
@@ -118,7 +118,10 @@ def _states(
 
 
 def _shades(frame: Frame | None, height: int, width: int) -> U1:
-    """Return the grey level (n,) of each pixel, as if lit from the camera; nearer is brighter."""
+    """Return the grey level (n,) of each pixel, from 0 to `_SHADES` - 1.
+
+    Surfaces are lit from the camera; nearer ones are brighter.
+    """
     if frame is None or frame.depth is None:
         return np.full(height * width, _SHADES * 3 // 4)
     depth = np.asarray(frame.depth, np.float64)
@@ -147,10 +150,10 @@ def _captions(
     pairs: Mapping[int, int],
     width: int,
 ) -> tuple[Caption, ...]:
-    """Return a caption for each difference, at the position of its object.
+    """Return a caption for each difference, above its object; none for objects without a mask.
 
-    ``pairs`` maps found to true objects; ``rows`` are the differences of found, then of missed
-    objects. The picture is ``width`` pixels wide.
+    ``pairs`` maps found to true objects; ``rows`` are those of found, then of missed objects. The
+    picture is ``width`` pixels wide.
     """
     missed = [item for j, item in enumerate(true) if j not in pairs.values()]
     captions = []

@@ -62,6 +62,7 @@ def open_reference(
     Raises
     ------
     RecordingError : the path is none of these, or is damaged.
+    OutputError : the run is not complete.
     """
     if (path / "run.json").is_file():
         return OtherRun(path)
@@ -287,10 +288,11 @@ def _item(
     full: Sequence[Box | None],
     up: Sequence[float],
 ) -> LabelledItem:
-    """Join detections to one object.
+    """Join detections into one object.
 
-    ``label`` is its track, category and confidence; ``full`` are the full boxes of the detections,
-    None if unknown; ``up`` (3,) is the up direction. The largest detection gives ``view_category``.
+    ``label`` is its track, category and confidence; ``rows`` are the detections' rows in the table,
+    ``full`` their full boxes, None if unknown; ``up`` (3,) is the up direction. The largest
+    detection gives ``view_category``.
     """
     track, category, confidence = label
     boxes = [

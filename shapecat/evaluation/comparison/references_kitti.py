@@ -28,10 +28,10 @@ class KittiLabels(Reference[str]):
     """Boxes of KITTI labels, without masks and identities.
 
     ``frames.csv`` gives the timestamp of each label file, its frame number where timestamps
-    repeat, and its topic where there are several; without it, the file's number is the frame
-    number. Boxes are in the rectified camera frame; the row ``Tr_rect_to_sensor`` of the
-    calibration turns them into the sensor frame. Without this row, as in KITTI's own data, the two
-    frames are taken to be the same.
+    repeat, and its topic where there are several; without ``frames.csv``, the number in a label
+    file's name is the frame number. Boxes are in the rectified camera frame; the row
+    ``Tr_rect_to_sensor`` of the calibration rotates them into the sensor frame. Without this row,
+    as in KITTI's own data, or without the file, the two frames are taken to be the same.
 
     A KITTI type cannot hold spaces, which are written as ``_``. A type stands for the first of
     ``categories`` that is written like it; if there is none, each ``_`` is read as a space.
@@ -56,7 +56,7 @@ class KittiLabels(Reference[str]):
 
         Raises
         ------
-        RecordingError : a label or calibration file is missing or damaged.
+        RecordingError : the label file is missing or damaged, or the calibration is damaged.
         """
         path = self.path / "label_2" / f"{entry}.txt"
         try:
@@ -88,7 +88,7 @@ def _listed(path: Path) -> list[tuple[Place, str]]:
 
 
 def _place(row: Mapping[str, str], *, several: bool) -> Place:
-    """Return topic (None for any), stamp and frame number of a row of frames.csv."""
+    """Return the `Place` of a row of frames.csv; with the topic if there are ``several``."""
     frame = row.get("frame")
     return row["topic"] if several else None, int(row["stamp_ns"]), int(frame) if frame else None
 
