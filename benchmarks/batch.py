@@ -26,7 +26,7 @@ SHARDS = 4
 
 
 def make(folder: Path, *, recordings: int, broken: int, frames: int) -> Path:
-    """Write recordings of all formats, some of which cannot be read."""
+    """Write recordings of all formats, ``broken`` of which cannot be read; return the folder."""
     folder.mkdir()
     views, _ = tabletop(60)
     for k in range(recordings - broken):

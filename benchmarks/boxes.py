@@ -32,9 +32,9 @@ from shapecat.types import Box
 SAME = 0.5
 """IoU of masks from which a detection matches an object."""
 ROUND = ("cup", "can", "bottle", "bowl", "plate", "ball")
-"""Solids of revolution, most of which have nearly equal length and width."""
+"""Categories whose objects are solids of revolution; most have nearly equal length and width."""
 ALIKE = 0.05
-"""Largest relative difference of length and width of a round object; others have a yaw."""
+"""Maximum relative difference of length and width of a round object without a yaw."""
 SCORED = ("cup", "can", "box", "bottle", "bowl", "ball")
 KINDS: tuple[SceneKind, ...] = ("tabletop", "pile")
 GROUPS = ("tabletop, upright", "tabletop, lying", "pile, upright", "pile, tilted")
@@ -115,7 +115,7 @@ def _evaluate_run(folder: Path, seed: int) -> Iterator[ScoredObject]:
 
 
 def by_frame(path: Path) -> dict[int, list[dict[str, Any]]]:
-    """Return the rows of a table by frame."""
+    """Return the rows of a Parquet table by frame number."""
     grouped: dict[int, list[dict[str, Any]]] = {}
     for row in pq.read_table(path).to_pylist():
         grouped.setdefault(row["frame"], []).append(row)
@@ -127,7 +127,8 @@ def matches(
 ) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
     """Match true and found objects one to one by their pixels; yield the pairs.
 
-    ``labels`` (h, w) are the true pixel labels of the frame.
+    ``objects`` are from the truth and ``rows`` from the detections of one frame; ``labels`` (h, w)
+    are its true pixel labels. Pairs need an IoU of `SAME` and `SEEN_PIXELS` true pixels.
     """
     inside = [np.bincount(labels.reshape(-1)[r["indices"]], minlength=256) for r in rows]
     iou = np.zeros((len(objects), len(rows)))

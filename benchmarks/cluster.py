@@ -85,6 +85,8 @@ def simulate(
 ) -> dict[str, float]:
     """Return the hours, the efficiency, and the utilization of each shared resource.
 
+    All but the hours are fractions. ``written_mb``, per frame, replaces that of ``given``.
+
     Recordings are sent out largest first. Each one queues for the scheduler, for reading from the
     storage, for its worker's core, for writing to the storage, and for the manifest.
     """

@@ -18,7 +18,7 @@ from shapecat.detection import detect
 from shapecat.types import Frame
 
 ROUNDS = 8
-"""Number of rounds; methods alternate, as the speed of a machine changes within seconds."""
+"""Number of rounds, each with all methods, as the speed of a machine changes within seconds."""
 PCL = ("segmentation", "features", "filters", "sample_consensus", "search", "kdtree", "common")
 RANGE_M = 2.0
 """Range of all methods, metres."""
@@ -47,7 +47,7 @@ def run(count: int) -> str:
 
 
 def _time_all(frames: list[Frame], program: Path | None) -> dict[str, dict[str, float]]:
-    """Time every method on every frame in rounds; summarise each frame's best time."""
+    """Time every method on every frame in rounds; return the `summary` of the best times, in ms."""
     settings = DetectionSettings(max_range_m=RANGE_M)
     ups = [detect(f, settings=settings, rng=np.random.default_rng(0)).up for f in frames]
     loose = [_unorganized(frame) for frame in frames]
@@ -75,7 +75,10 @@ def _unorganized(frame: Frame) -> Frame:
 
 
 def _time_open3d(frames: list[Frame], ups: list[Any]) -> list[float]:
-    """Return the CPU times of Open3D: pass-through, 1 cm voxels, RANSAC plane, DBSCAN above it."""
+    """Return the CPU time of Open3D for each frame, ms; none if it is not installed.
+
+    The method is a pass-through filter, 1 cm voxels, a RANSAC plane, and DBSCAN above it.
+    """
     try:
         import open3d as o3d  # noqa: PLC0415  may lack its system libraries
     except (ImportError, OSError):
@@ -116,7 +119,7 @@ def _build_pcl(folder: Path) -> Path | None:
 
 
 def _write_clouds(path: Path, frames: list[Frame], ups: list[Any]) -> Path:
-    """Write the frames in the format of the PCL program."""
+    """Write frames and their up directions in the format of the PCL program; return the path."""
     with path.open("wb") as file:
         for frame, up in zip(frames, ups, strict=True):
             height, width = frame.depth.shape if frame.depth is not None else (1, 0)

@@ -24,7 +24,7 @@ from shapecat.simulation.scenes.kinds import SceneKind
 KINDS: tuple[SceneKind, ...] = ("tabletop", "clutter", "pile")
 RANGES_M = ((0.3, 0.45), (0.45, 0.7), (0.7, 1.1), (1.1, 1.7), (1.7, 2.6))
 MARGIN_M = 0.05
-"""Sensors whose near limit is closer than this to the end of a range are left out of it."""
+"""Sensors that can measure less than this much of a range, at its far end, are left out of it."""
 HEAD = ("distance, m", "frames", "objects", "found", "mean F", "surplus a frame")
 
 
@@ -37,7 +37,7 @@ def evaluate(world: World, sensor: Sensor, range_m: tuple[float, float], seed: i
 
 
 def row(worlds: Sequence[World], first: int, range_m: tuple[float, float]) -> tuple[Any, ...]:
-    """Return the row of the table for a range of distances, metres."""
+    """Return the row of the table for a range of distances, metres; ``first`` is the first seed."""
     sensors = [s for s in PRESETS.values() if s.nearest_m < range_m[1] - MARGIN_M]
     total = Counts(0, 0, 0, 0, 0, 0, 0.0)
     for k, world in enumerate(worlds):

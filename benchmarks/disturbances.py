@@ -22,7 +22,7 @@ STEP_PER_M = 0.0029
 """Step of 1/depth of a Kinect, which measures disparity in eighths of a pixel."""
 
 Change = Callable[[Array, Array, Camera, Generator], tuple[Array, Array, Camera]]
-"""Changes a depth image, its labels (both h w) and its camera."""
+"""Changes a depth image (h, w), its labels (h, w) and its camera; may draw random numbers."""
 
 
 def _mirrored(depth: Array, labels: Array, camera: Camera, _: Generator) -> Any:

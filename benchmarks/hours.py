@@ -90,7 +90,10 @@ def _detections(numbers: Any, places: Any, beliefs: Any, rng: Any) -> dict[str, 
 
 
 def _shown(numbers: Any, rng: Any) -> tuple[Any, Any]:
-    """Return the frame and the object of each detection; an object >= `OBJECTS` is false."""
+    """Return, for each detection, an index into the frame ``numbers``, and its object.
+
+    An object >= `OBJECTS` is a false detection.
+    """
     shown = rng.random((len(numbers), OBJECTS + PLACES_OF_FALSE)) > OVERLOOKED
     turn = (numbers[:, None] + np.arange(OBJECTS) * VISIT_FRAMES // OBJECTS) % VISIT_FRAMES
     shown[:, :OBJECTS] &= turn >= AWAY_FRAMES

@@ -9,7 +9,7 @@ from shapecat.evaluation.comparison.overlap import Overlap, match_masks
 from shapecat.types import Frame
 
 Finder = Callable[[Frame], list[Array]]
-"""Returns the pixel indices of each object that it finds in a frame."""
+"""Returns the pixel indices (k,) of each object that it finds in a frame."""
 
 
 def labelled_sets(count: int, first_seed: int) -> dict[str, list[Labelled]]:

@@ -41,7 +41,7 @@ class ScoredObject(NamedTuple):
 def evaluate(
     kind: str, sensor: str, first: int, count: int, model: Categorizer, settings: Settings
 ) -> tuple[list[ScoredObject], Overlap]:
-    """Perceive one frame of each scene; return the found objects and the overlap of all."""
+    """Perceive one frame of each scene; return the found objects, and the overlap of all masks."""
     found: list[ScoredObject] = []
     overlap = Overlap()
     for seed in range(first, first + count):

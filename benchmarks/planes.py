@@ -27,7 +27,7 @@ from shapecat.simulation.shapes.primitives import rounded_box
 from shapecat.types import CATEGORIES, Camera, Frame, Pose, Scene
 
 HEIGHT_M, TILT_COS = 0.02, float(np.cos(np.radians(4)))
-"""Largest distance and tilt of a found plane from the table."""
+"""Maximum height of a found plane above or below the table, and cosine of its maximum tilt."""
 COVERED, SHOWN, SEEN = 0.8, 0.2, 0.01
 """Fraction of a covered table under boxes; fraction of the image filled by a cut table and its
 objects; least fraction of the image in which a covered table is visible between its boxes."""
@@ -65,7 +65,10 @@ def _flat_boxes(rng: Generator, table: Support) -> tuple[PlacedObject, ...]:
 
 
 def _tiles(rng: Generator, low: Array, high: Array, count: int) -> Iterator[tuple[Array, Array]]:
-    """Divide a rectangle recursively across its longer side into ``count`` tiles; yield corners."""
+    """Divide a rectangle recursively, across its longer side, into ``count`` tiles.
+
+    Yields the lowest and the highest corner (2,) of each tile.
+    """
     if count == 1:
         yield low, high
         return
@@ -89,12 +92,12 @@ def cut(rng: Generator) -> World:
             gaze = np.cos(turn) * pose.rotation[:, 2] + np.sin(turn) * aside
             world = replace(world, path=(looking_at(pose.translation, pose.translation + gaze),))
             near, far = (turn, far) if sum(_shown(world)) > SHOWN else (near, turn)
-        if sum(_shown(world)) > SHOWN / 2:  # else it is nearer than a Kinect can measure
+        if sum(_shown(world)) > SHOWN / 2:  # else the table is nearer than a Kinect can measure
             return world
 
 
 def _shown(world: World) -> tuple[float, float]:
-    """Return the fractions of the image that show the table and the objects on it."""
+    """Return the fraction of the image that shows the table, and that of the objects on it."""
     seen = render(world.geometry(0), PREVIEW, world.path[0])
     mesh_ids = np.where(seen.depth > KINECT.nearest_m, seen.mesh_ids, -1)
     table = mesh_ids == world.supports.index(_table(world))

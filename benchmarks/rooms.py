@@ -30,8 +30,8 @@ class Counts(NamedTuple):
 
     Attributes
     ----------
-    elsewhere : detections on no object.
-    pieces : detections of an object in addition to the best one.
+    elsewhere : number of detections on no object.
+    pieces : number of detections of an object in addition to its best one.
     objects, found : number of true objects, and of those found.
     f : sum of the overlap F of all objects, 0 for missed ones.
     """

@@ -40,7 +40,7 @@ def simulated_frame(kind: SceneKind, seed: int, sensor: Sensor) -> tuple[World, 
 
 
 def object_masks(labels: Array) -> list[Array]:
-    """Return the pixel indices of each simulated object, by the pixel labels (h * w,)."""
+    """Return the pixel indices (k,) of each simulated object, given the pixel labels (h * w,)."""
     seen = np.unique(labels)
     return [np.flatnonzero(labels == label) for label in seen[seen >= FIRST_OBJECT_LABEL]]
 
@@ -51,7 +51,7 @@ def detected(frame: Frame) -> Scene:
 
 
 def simulated_clutter(count: int, first_seed: int = 500) -> Iterator[Frame]:
-    """Return a Kinect frame of each of ``count`` cluttered tables."""
+    """Yield a Kinect frame of each of ``count`` cluttered tables."""
     return (labelled.frame for labelled in labelled_clutter(count, first_seed))
 
 

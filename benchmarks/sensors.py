@@ -26,13 +26,14 @@ WINDOWS = {"roughness": 16, "warp": 96}
 """Width of the windows, pixels of an image 640 pixels wide: the small one shows noise, the large
 one the warping of planes."""
 QUIETEST = 0.25
-"""Quantile of the windows that are treated as planes; noisier windows contain objects."""
+"""The noise of planes is this quantile over all windows; noisier windows contain objects."""
 JUMP_M, EDGE_PX = 0.06, 12
 """Edges are depth steps of at least this height within this number of pixels."""
 STEPS, STEP_PX = (0.03, 0.07), 12
-"""Small steps of the inverse depth, 1/m, and the number of pixels within which they are."""
+"""Least and largest height of a small step of the inverse depth, 1/m, and its maximum width,
+pixels."""
 STRAIGHT = 0.0006
-"""Maximum change of the slope of the inverse depth on both sides of a small step, 1/m per pixel."""
+"""Maximum change of the slope of the inverse depth on each side of a small step, 1/m per pixel."""
 HEAD = (
     *("sensor", "frames", "distance, m", "roughness, 1/m", "warp, 1/m"),
     *("edge, px", "step, px", "holes"),
@@ -75,7 +76,10 @@ def measure_frame(depth: Array) -> Figures:
 
 
 def _roughness(inverse: Array, width: int) -> float:
-    """Return the standard deviation of the inverse depth from planes in quiet windows, 1/m."""
+    """Return the standard deviation of the inverse depth from planes in quiet windows, 1/m.
+
+    ``inverse`` (h, w) is 0 where there is no depth; a window is ``width`` pixels wide.
+    """
     v, u = np.mgrid[:width, :width].reshape(2, -1) - width / 2
     design = np.column_stack([u, v, np.ones(width * width)])
     project = np.linalg.pinv(design)
@@ -90,7 +94,10 @@ def _roughness(inverse: Array, width: int) -> float:
 
 
 def _edge_width(depth: Array, width: int) -> float:
-    """Return the mean number of pixels between the two sides of a depth step along rows."""
+    """Return the mean number of pixels between the two sides of a depth step along rows.
+
+    ``depth`` (h, w) is in metres; the step is within ``width`` pixels.
+    """
     near, far = depth[:, : -width - 1], depth[:, width + 1 :]
     step = (near > 0) & (far > 0) & (np.abs(far - near) > JUMP_M)
     between = np.zeros(step.shape, np.int64)

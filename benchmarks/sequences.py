@@ -51,7 +51,7 @@ class Object:
     center : (3,) metres, fixed frame.
     reach : largest distance of a matching track's centre, metres.
     undecidable : whether its category is ambiguous in this view.
-    spared : whether too little of it is visible, or it is too far, so that it is ignored.
+    spared : whether it is ignored, as too little of it is visible or it is too far away.
     """
 
     track: int
@@ -118,7 +118,7 @@ def frame_identities(folder: Path, truth: Sequence[Sequence[Object]]) -> Iterato
     """Yield the objects and tracks of each frame with their similarity.
 
     Tracks that match a spared object are ignored. The similarity falls with the distance, from 1
-    to `SAME` at the largest reach.
+    to `SAME` at the largest reach of all objects; it is 0 beyond the reach of the object.
     """
     table = _within_range(folder / "run")
     sequence = str(folder)
@@ -187,7 +187,10 @@ def read_views(folder: Path, kind: str, seed: int) -> list[View]:
 def _seen(
     indices: Sequence[int], labels: U1, objects: Sequence[dict[str, Any]]
 ) -> dict[str, Any] | None:
-    """Return the object whose mask a detection matches; None if there is none."""
+    """Return the object whose mask a detection matches; None if there is none.
+
+    ``indices`` (k,) are the pixels of the detection, ``labels`` (h, w) the true pixel labels.
+    """
     own = np.bincount(labels.reshape(-1)[indices], minlength=256)
     label = int(own.argmax())
     union = len(indices) + int((labels == label).sum()) - own[label]

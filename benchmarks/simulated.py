@@ -82,7 +82,10 @@ def _views(kind: SceneKind, first: int, count: int) -> Iterator[View]:
 
 
 def _matches(view: View, total: Counter[str]) -> dict[int, int]:
-    """Match candidates and objects one to one; return the candidate of each hit by label."""
+    """Match candidates and objects one to one, and count objects, hits and detections.
+
+    Returns the index of the candidate that found each object, by the object's label.
+    """
     labels, candidates = view.labels, view.found.candidates
     seen = np.bincount(labels, minlength=256)
     listed = [t.label for t in view.world.objects if seen[t.label] >= SEEN_PIXELS]
@@ -112,7 +115,7 @@ def _heights(view: View) -> Array:
 
 
 def _score_planes(view: View, total: Counter[str]) -> None:
-    """Count the scene if all well visible planes were found, and no false ones."""
+    """Count the scene if all clearly visible planes were found, and no false ones."""
     up = inverse(view.world.path[0]).rotation[:, 2]
     points = view.frame.xyz()
     height = points @ up + view.world.path[0].translation[2]
@@ -130,7 +133,10 @@ def _score_planes(view: View, total: Counter[str]) -> None:
 
 
 def _score_relations(view: View, matches: dict[int, int], total: Counter[str]) -> None:
-    """Count the objects with the right support, if object and support were found."""
+    """Count the support relations of found objects, and the right ones.
+
+    Objects on an object that was not found are left out; ``matches`` are from `_matches`.
+    """
     by_track = {t.track: t for t in view.world.objects}
     heights = {s.name: s.height for s in view.world.supports if s.holds_objects}
     found = _heights(view)

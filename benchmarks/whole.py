@@ -44,7 +44,7 @@ class View(NamedTuple):
 
 
 def find_world(frames: int, objects: int) -> World:
-    """Return the first simulated table with this number of objects."""
+    """Return the first of 100 simulated tables with this number of objects, else the last one."""
     for seed in range(SEED, SEED + 100):
         world = make_scene("tabletop", np.random.default_rng(seed), frames=frames)
         if len(world.objects) == objects:
@@ -62,7 +62,7 @@ def tabletop(frames: int, *, objects: int = 8) -> tuple[list[View], int]:
 
 
 def standing(frames: int, *, objects: int = 8) -> list[View]:
-    """Render the same table from one position; the views differ only in noise."""
+    """Render the table of `tabletop` from one position; the views differ only in noise."""
     world = find_world(frames, objects)
     sees = (np.random.default_rng(k) for k in range(frames))
     return [View(render_frame(world, 0, rng=rng, sensor=KINECT)[0], world.path[0]) for rng in sees]
