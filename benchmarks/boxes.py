@@ -1,4 +1,4 @@
-"""3D overlap of estimated and true boxes, by category, from simulated recordings to tables.
+"""3D overlap of estimated and true boxes, by category, for simulated recordings.
 
     python -m benchmarks.boxes --first 1000 --count 20
 

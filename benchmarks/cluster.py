@@ -209,7 +209,7 @@ def per_hour(costs: Measured, given: Assumed) -> list[tuple[str, ...]]:
 
 
 def check(folder: Path, *, recordings: int, frames: int) -> list[tuple[str, ...]]:
-    """Compare the model with 1 to 4 workers that share the cores of this machine."""
+    """Compare the model with 1 to 4 workers that share the two cores of this machine."""
     from tests.scenes import record  # noqa: PLC0415  the small scene of the tests
 
     (folder / "in").mkdir()

@@ -1,4 +1,4 @@
-"""Objects found by the distance of the camera, with every simulated sensor.
+"""Fraction of the objects found at each distance of the camera, with every simulated sensor.
 
     python -m benchmarks.distances --first 1168000 --count 60
 

@@ -1,4 +1,4 @@
-"""IoU of masks on the colour image with the true ones, from simulated recordings to a data set.
+"""IoU of found and true masks on the colour image, for simulated recordings.
 
     python -m benchmarks.masks --first 1000 --count 20
 

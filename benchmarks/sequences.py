@@ -34,7 +34,8 @@ from shapecat.types import CATEGORIES
 KINDS: tuple[SceneKind, ...] = ("turntable", "walking", "crossing", "rearranged")
 FRAMES, RATE_HZ = 60, 10.0
 NEAR_M = 0.1
-"""A track matches an object if their centres are this near, or nearer than half its length."""
+"""A track matches an object if their centres are within this distance, metres, or within half the
+object's length."""
 RANGE_M = 2.0
 """Objects and tracks farther from the sensor are ignored."""
 SAME = 0.5

@@ -55,7 +55,7 @@ def main(*, kinds: tuple[SceneKind, ...], first: int, count: int) -> None:
 
 
 def score(kind: SceneKind, first: int, count: int) -> Counter[str]:
-    """Return the counts over all scenes."""
+    """Return the counts over ``count`` scenes of a kind, the first with the seed ``first``."""
     total: Counter[str] = Counter()
     for view in _views(kind, first, count):
         matches = _matches(view, total)

@@ -20,7 +20,7 @@ from shapecat.surface import reconstruct, voxelize
 
 
 def run(count: int) -> str:
-    """Time each stage for each object of ``count`` frames; return a table."""
+    """Time each stage for up to four objects in each of ``count`` frames; return a table."""
     settings, model = Settings(), load_model(None)
     timed: dict[str, list[float]] = {}
     objects: list[tuple[F4, F8]] = []
@@ -59,7 +59,7 @@ def _seeded(grow: Callable[..., Any]) -> Any:
 
 
 def _categorize(points: F4, eye: F8, settings: Settings, model: Categorizer) -> None:
-    """Run all stages of one object."""
+    """Run all stages for one object, from its points to its posterior."""
     cloud = voxelize(points, voxel_m=settings.surface.voxel_m)
     gas = reconstruct(cloud, settings=settings.surface, rng=np.random.default_rng(0))
     if gas is not None:

@@ -43,7 +43,7 @@ class CloudFile(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """How a file stores points: type of a point, number of points, encoding, and first byte."""
+    """How a file stores points: type of a point, number of points, encoding, offset of the body."""
 
     point: np.dtype
     number: int

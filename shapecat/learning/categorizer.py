@@ -169,7 +169,7 @@ class Categorizer(Record):
 
 
 def parts_of(record: Record, prefix: str = "") -> dict[str, Any]:
-    """Return the arrays and plain values in a record and in its records, by dotted name.
+    """Return the arrays and plain values of a record and of nested records, by dotted name.
 
     Each name begins with ``prefix``.
     """

@@ -198,10 +198,10 @@ def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, l2: float, steps: i
 def _shift(
     inputs: _Inputs, old: F8, truth: I4, learned: F8, l2: float, rng: np.random.Generator
 ) -> float:
-    """Return the largest constant that can be added to the new logits with little harm.
+    """Return the constant to add to the new logits: the largest that does little harm.
 
-    With it, the new categories take over at most a fraction `_LOST` of the views that the old
-    logits categorize correctly. It is from 0 to `_LARGEST_SHIFT`. The new logits of a view come
+    It is limited to 0 to `_LARGEST_SHIFT`. With it, the new categories take over at most a fraction
+    `_LOST` of the views that the old logits categorize correctly. The new logits of a view come
     from a fit without the view. The parameters are as for `_fit_new`; ``learned`` are the weights
     that it returned for all views.
     """

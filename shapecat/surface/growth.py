@@ -24,8 +24,8 @@ __all__ = ["Cloud", "Rates", "grow_fritzke", "grow_thesis"]
 
 
 _GAIN = 1 / 0.9995
-"""Weight of an error relative to that of the signal before: with each signal, the errors so far
-decay to 0.9995 of their size."""
+"""Factor by which errors gain weight with each signal, instead of a decay of all earlier errors to
+0.9995 of their size."""
 
 
 class Cloud(NamedTuple):
@@ -53,9 +53,9 @@ class Rates(NamedTuple):
 
 @kernel(inner=True)
 def _drop_old_edges(degree: I4, wins: I4, edge_birth: I4, count: int, a: int, oldest: int) -> None:
-    """Remove the edges of neuron ``a`` older than ``oldest``; ``count`` is the number of neurons.
+    """Remove the edges of neuron ``a`` that are older than ``oldest``, but no neuron's last edge.
 
-    The arrays are from a `Gas`.
+    The arrays are from a `Gas` of ``count`` neurons.
     """
     for j in range(count):
         age = wins[a] + wins[j] - edge_birth[a * degree.size + j]

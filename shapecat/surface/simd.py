@@ -40,13 +40,13 @@ class _Vectors:
         return self._context.make_array(kind)(self._context, self.build, value).data
 
     def splat(self, value: _Value, kind: Any) -> _Value:
-        """Return a vector, of the LLVM type ``kind``, of equal values."""
+        """Return a vector of the LLVM type ``kind`` whose elements are all ``value``."""
         blank = ir.Constant(kind, ir.Undefined)
         first = self.build.insert_element(blank, value, _I32(0))
         return self.build.shuffle_vector(first, blank, ir.Constant(_INTS, [0] * LANES))
 
     def load(self, address: _Value, index: _Value, kind: Any) -> _Value:
-        """Return the vector, of the LLVM type ``kind``, that begins at an index of an array."""
+        """Return the vector of the LLVM type ``kind`` that begins at an index of an array."""
         place = self.build.bitcast(self.build.gep(address, [index]), kind.as_pointer())
         return self.build.load(place, align=4)
 

@@ -46,8 +46,8 @@ def smooth(points: F4, *, radius_m: float) -> F4:
     For the neighbours p_i of a point p within the radius h, weighted by
     ``w_i = exp(-|p_i - p|**2 / (h / 2)**2)``:
 
-    1. fit the plane through their weighted mean whose normal n is the direction of least weighted
-       variance; q is the projection of p onto it;
+    1. fit a plane through their weighted mean; its normal n is the direction of least weighted
+       variance, and q is the projection of p onto the plane;
     2. fit the polynomial g of degree 2 over the plane, with origin q, that minimises
        ``sum_i w_i (n . (p_i - q) - g(u_i, v_i))**2``;
     3. move p to ``q + g(0, 0) n``.
@@ -69,8 +69,8 @@ def smooth(points: F4, *, radius_m: float) -> F4:
 
     Notes
     -----
-    Time grows with the points times their neighbours. Sources: Levin 2003; Alexa et al. 2003,
-    section 3; thesis 4.2.
+    Time grows with the number of points times the number of neighbours. Sources: Levin 2003; Alexa
+    et al. 2003, section 3; thesis 4.2.
     """
     points = read_only(points)
     if not radius_m > 0:

@@ -48,7 +48,7 @@ class _Occurrences(NamedTuple):
 
     Attributes
     ----------
-    true, found : number of frames with each true and each found identity.
+    true, found : (t,) and (f,) number of frames with each true and with each found identity.
     frames : for each frame, the numbers of its true and found identities, and their similarity.
     """
 
@@ -204,7 +204,7 @@ def _count_matches(
 
 
 def _alignment(occurrences: _Occurrences) -> F8:
-    """Return the fraction of the frames of two identities in which they coincide, (true, found)."""
+    """Return how well two identities coincide over all frames, from 0 to 1, for (true, found)."""
     together = np.zeros((occurrences.true.size, occurrences.found.size))
     for true, found, similarity in occurrences.frames:
         beside = similarity.sum(axis=0) + similarity.sum(axis=1)[:, None] - similarity

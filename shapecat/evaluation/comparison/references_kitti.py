@@ -31,7 +31,7 @@ class KittiLabels(Reference[str]):
     repeat, and its topic where there are several; without ``frames.csv``, the number in a label
     file's name is the frame number. Boxes are in the rectified camera frame; the row
     ``Tr_rect_to_sensor`` of the calibration rotates them into the sensor frame. Without this row,
-    as in KITTI's own data, or without the file, the two frames are taken to be the same.
+    as in KITTI's own data, or without a calibration file, both frames are taken to be the same.
 
     A KITTI type cannot hold spaces, which are written as ``_``. A type stands for the first of
     ``categories`` that is written like it; if there is none, each ``_`` is read as a space.
@@ -88,7 +88,7 @@ def _listed(path: Path) -> list[tuple[Place, str]]:
 
 
 def _place(row: Mapping[str, str], *, several: bool) -> Place:
-    """Return the `Place` of a row of frames.csv; with the topic if there are ``several``."""
+    """Return the `Place` of a row of frames.csv; its topic is None unless there are ``several``."""
     frame = row.get("frame")
     return row["topic"] if several else None, int(row["stamp_ns"]), int(frame) if frame else None
 
