@@ -1,4 +1,4 @@
-"""Rules for names of category folders: a model learns them, and its runs use them as labels."""
+"""Rules for the names of category folders, which a model learns and its runs use as labels."""
 
 import unicodedata
 from collections.abc import Iterable
