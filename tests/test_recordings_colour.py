@@ -49,9 +49,11 @@ WIDE = Camera(80, 60, 71.0, 72.0, 40.2, 29.1)
 Pairs = list[tuple[Frame, ColourView | None]]
 
 
-def read(path: Path, wanted: str | None = None, **frame_range: Any) -> tuple[Pairs, list[str]]:
+def read(
+    path: Path, wanted: str | None = None, topics: Sequence[str] = (), **frame_range: Any
+) -> tuple[Pairs, list[str]]:
     with open_recording(path) as recording:
-        streams = choose_streams(recording)
+        streams = choose_streams(recording, topics)
         colours = pair_colours(recording, streams, wanted)
         chosen = FrameRange(**frame_range)
         pairs = frames_with_colour(recording, streams, colours, chosen, skipped=Counter())
@@ -516,6 +518,24 @@ def test_calibrations_of_zeros_do_not_replace_one(tmp_path: Path, zeros: Sequenc
         assert any("CameraInfo without intrinsics" in warning for warning in warnings)
     else:
         assert not warnings
+
+
+def test_sensors_without_frame_ids_do_not_share_their_colour(tmp_path: Path) -> None:
+    """Some drivers leave all ids empty, which is not the same frame."""
+    items: list[tuple[str, int, Any]] = []
+    for name in ("a", "b"):
+        items.append((f"/{name}/depth/camera_info", EPOCH, info(EPOCH)))
+        depth = image(EPOCH, wavy_depth(), frame_id="")
+        items.append((f"/{name}/depth/image_raw", EPOCH, depth))
+    items.append(("/b/color/image_raw", EPOCH, raw(EPOCH, gradient(), "rgb8", "")))
+
+    topics = ["/a/depth/image_raw", "/b/depth/image_raw"]
+    pairs, _ = read(write(tmp_path / "a.mcap", items), topics=topics)
+
+    assert {frame.topic: image is not None for frame, image in pairs} == {
+        "/a/depth/image_raw": False,
+        "/b/depth/image_raw": True,
+    }
 
 
 def test_colour_without_transform_is_unused(tmp_path: Path) -> None:

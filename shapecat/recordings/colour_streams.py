@@ -186,7 +186,7 @@ def _belongs(
 
     ``nearest`` are the sensors nearest to the colour topic, from `_nearest_sensors`.
     """
-    if same_frame(one.frame_id, stream.frame_id):
+    if _is_in_frame_of(one, stream):
         return True
     shared = _shared(one, stream)
     others = (near.shared for near in nearest[stream.kind] if stream not in near.streams)
@@ -215,7 +215,7 @@ def _select(
 def _rank(one: ColourStream, stream: Stream) -> tuple[bool, int, bool, bool, int, bool, str]:
     """Return the key by which the colour streams of a depth stream are sorted, the best first."""
     return (
-        not (one.frame_id and same_frame(one.frame_id, stream.frame_id)),
+        not _is_in_frame_of(one, stream),
         -_shared(one, stream),
         not any(word in one.topic.lower() for word in _COLOUR_WORDS),
         not is_rectified(one.topic),
@@ -223,6 +223,11 @@ def _rank(one: ColourStream, stream: Stream) -> tuple[bool, int, bool, bool, int
         one.kind != "compressed",
         one.topic,
     )
+
+
+def _is_in_frame_of(one: ColourStream, stream: Stream) -> bool:
+    """Return whether the images are in the sensor frame of a depth stream; not if it has no id."""
+    return one.frame_id != "" and same_frame(one.frame_id, stream.frame_id)
 
 
 def _shared(one: ColourStream, stream: Stream) -> int:
