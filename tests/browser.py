@@ -36,7 +36,10 @@ def _strokes(keys: list[str]) -> list[dict[str, str]]:
 
 
 class Browser:
-    """A headless Chromium, driven over the WebDriver protocol."""
+    """A headless Chromium, driven over the WebDriver protocol; without one, the test is skipped.
+
+    ``folder`` is for the browser's profile and its downloads.
+    """
 
     def __init__(self, folder: Path) -> None:
         driver = shutil.which("chromedriver")
@@ -111,7 +114,7 @@ class Browser:
         self._ask("POST", f"/element/{self._find(selector)}/value", {"text": text})
 
     def press(self, *keys: str) -> None:
-        """Press keys one after the other on the focused element; `Control+z` holds the first."""
+        """Press keys in turn on the focused element; ``Control+z`` is z with Control held down."""
         events = [event for key in keys for event in _strokes(key.split("+"))]
         source = {"type": "key", "id": "keyboard", "actions": events}
         self._ask("POST", "/actions", {"actions": [source]})
@@ -133,7 +136,7 @@ class Browser:
         self._ask("DELETE", "/window")
 
     def renew(self) -> None:
-        """Leave one empty tab, without stored corrections and console messages of other tests."""
+        """Close all tabs but one, and discard its page, stored corrections and console messages."""
         first, *others = self.tabs()
         for tab in others:
             self.turn_to(tab)
@@ -158,11 +161,11 @@ class Browser:
         return self._ask("POST", "/goog/cdp/execute", {"cmd": command, "params": parameters})
 
     def complaints(self) -> list[str]:
-        """Return the warnings and errors in the console."""
+        """Return the messages that the console has received since the last call."""
         return [entry["message"] for entry in self._ask("POST", "/se/log", {"type": "browser"})]
 
     def downloaded(self) -> Path:
-        """Wait for a download to be complete."""
+        """Wait until a CSV file is downloaded; return its path."""
         deadline = time.monotonic() + _WAIT_S
         while time.monotonic() < deadline:
             with suppress(FileNotFoundError):  # the browser renames it

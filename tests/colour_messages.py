@@ -24,7 +24,7 @@ def png(colours: Any) -> bytes:
 
 
 def raw(stamp: int, data: Any, encoding: str, frame_id: str = "camera") -> Any:
-    """Make a raw image whose rows are padded by 5 bytes."""
+    """Make a raw image of ``data`` (h, w) or (h, w, channels), with rows padded by 5 bytes."""
     h, w = data.shape[:2]
     rows = np.ascontiguousarray(data).view(np.uint8).reshape(h, -1)
     rows = np.pad(rows, ((0, 0), (0, 5)))
@@ -32,12 +32,12 @@ def raw(stamp: int, data: Any, encoding: str, frame_id: str = "camera") -> Any:
 
 
 def packed(stamp: int, body: bytes, kind: str = "jpeg", frame_id: str = "camera") -> Any:
-    """Make a compressed image from its encoded bytes."""
+    """Make a compressed image of format ``kind`` from its encoded bytes."""
     return make(COMPRESSED, header(stamp, frame_id), kind, np.frombuffer(body, np.uint8))
 
 
 def gradient(height: int = 48, width: int = 64, seed: int = 0) -> Any:
-    """Make a smooth image, which JPEG preserves, of distinct colours."""
+    """Make an RGB image of smooth gradients, which JPEG preserves; ``seed`` sets the blue."""
     v, u = np.mgrid[:height, :width]
     red, green, blue = 255 * u / width, 255 * v / height, 40 + 10 * seed + 0 * u
     return np.stack([red, green, blue], axis=-1).astype(np.uint8)

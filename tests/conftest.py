@@ -44,7 +44,7 @@ SHARED = Path(__file__).parents[2] / "shared" / "data"
 
 
 def pytest_configure() -> None:
-    """Obey interrupts, which a shell ignores for background jobs, and skip fsync.
+    """Obey interrupts even in a background job, skip fsync, and seldom collect garbage.
 
     Only `test_run_folder` and `tests.faults` need fsync. Collecting garbage would take a third of
     the time of importing all tests.
@@ -60,9 +60,9 @@ def pytest_unconfigure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the longest files first, so that no worker is left with one at the end.
+    """Run the longest files first, so that all workers end at about the same time.
 
-    A worker takes a whole file, because of its fixtures.
+    A worker runs whole files, because of their fixtures.
     """
     rank = {name: k for k, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
@@ -70,7 +70,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Give each worker whole files, as ``--dist loadfile`` does, and those that belong together."""
+    """Give each worker whole files, as ``--dist loadfile`` does, and those of `TOGETHER` as one."""
     if config.getvalue("dist") != "loadfile":
         return None
 
@@ -94,7 +94,7 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def shapecat() -> Callable[..., Result]:
-    """Run the command as a user would, but in this process and as if the machine had one core.
+    """Return a function that runs the command in this process, as if the machine had one core.
 
     With more cores, worker processes would start for each short recording, only to end before they
     have loaded.
@@ -145,13 +145,13 @@ class LateAnswer(Future[Any]):
 
 
 class LateExecutor(Executor):
-    """Replaces the executor of other processes: it starts at once, and works on copies."""
+    """Replaces `LocalExecutor`: starts at once, and runs calls in this process, on copies."""
 
     def __init__(self, _workers: int, **_options: int) -> None:
         self._awake = False
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **_options: Any) -> Future[Any]:
-        """Send a call; the first one starts the process."""
+        """Return the answer to a call; the first call, which warms up a process, is not run."""
         answer = LateAnswer(fn, *args)
         if not self._awake:
             answer.set_result(None)
@@ -164,7 +164,7 @@ class LateExecutor(Executor):
 
 @pytest.fixture
 def late_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Send all frames, even the first ones, to another process, as many as it may hold."""
+    """Send all frames, even the first one, to a `LateExecutor`, as if to a slow process."""
     monkeypatch.setattr("shapecat.executors.ordered_pool._ITEMS_BEFORE_START", 0)
     monkeypatch.setattr("shapecat.executors.ordered_pool.LocalExecutor", LateExecutor)
 
@@ -196,7 +196,10 @@ def guessed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def guess_once(
     name: str, factory: pytest.TempPathFactory, *, rrd: bool = True, **scene: Any
 ) -> Path:
-    """Simulate a recording and process it, once for all test processes."""
+    """Simulate a recording and process it with a `Guesser`, once for all test processes.
+
+    ``name`` is that of the parent folder, ``scene`` are arguments of `simulate`. Return the run.
+    """
     import shapecat.pipeline
     from shapecat.runs.jobs import Job
     from shapecat.simulation import simulate
@@ -225,7 +228,7 @@ def run(guessed_run: Path, tmp_path: Path) -> Path:
 def drawn(guessed_run: Path) -> Any:
     """Return the `RunReport` of `guessed_run`, whose pictures are drawn once for all tests.
 
-    The page shows the labels in its ``folder``: `replace` this by the folder of a copy of the run.
+    The page shows the labels of the run in ``folder``; `replace` it to show those of a copy.
     """
     from shapecat.outputs.report.writing import read_report
 
@@ -234,7 +237,7 @@ def drawn(guessed_run: Path) -> Any:
 
 @pytest.fixture(scope="module")
 def snapped_once() -> Iterator[None]:
-    """Move the outlines of the same masks on the same image only once, for all exports."""
+    """Snap the same masks to the same image only once, for all exports of a test file."""
     from shapecat.colour.snapping import snapped
 
     cache: dict[str, Any] = {}

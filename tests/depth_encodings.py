@@ -8,7 +8,7 @@ import numpy as np
 
 
 def png(values: Any) -> bytes:
-    """Write a 16-bit grey PNG that uses every row filter in turn."""
+    """Encode values (h, w) as a 16-bit grey PNG that uses every row filter in turn."""
     rows = values.astype(">u2").view(np.uint8).astype(int)
     left, up = np.zeros_like(rows), np.zeros_like(rows)
     left[:, 2:], up[1:] = rows[:, :-2], rows[:-1]
@@ -33,7 +33,7 @@ def png(values: Any) -> bytes:
 
 
 def rvl(values: Any) -> bytes:
-    """Write RVL as described in its paper."""
+    """Encode values (h, w) in RVL, as described in its paper."""
     nibbles: list[int] = []
 
     def put(number: int) -> None:

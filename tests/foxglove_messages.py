@@ -16,7 +16,7 @@ DOUBLE, STRING, MESSAGE, RAW, ENUM, FIXED, INT64 = 1, 9, 11, 12, 14, 7, 3
 
 
 class Field(NamedTuple):
-    """A field: its name, its type as numbered in descriptor.proto, and the name of a message."""
+    """A field; ``kind`` is numbered as in descriptor.proto, ``message`` the name of its message."""
 
     name: str
     kind: int
@@ -118,7 +118,7 @@ def _class_of(name: str) -> Any:
 
 
 def time(stamp: int, encoding: str) -> dict[str, int]:
-    """Return a timestamp as an encoding writes it."""
+    """Return a stamp in nanoseconds as an encoding, ``protobuf`` or ``json``, writes it."""
     names = ("seconds", "nanos") if encoding == "protobuf" else ("sec", "nsec")
     return dict(zip(names, divmod(stamp, SECOND), strict=True))
 
@@ -129,7 +129,7 @@ def content(data: bytes, encoding: str) -> Any:
 
 
 def write(path: Path, encoding: str, items: list[tuple[str, str, dict[str, Any]]]) -> Path:
-    """Write messages given as topic, type and values."""
+    """Write messages given as topic, type and values; by default at `EPOCH`, in frame camera."""
     schema_encoding = "protobuf" if encoding == "protobuf" else "jsonschema"
     with mcap_writer(path, "") as writer:
         for k, (topic, kind, values) in enumerate(items):

@@ -17,7 +17,7 @@ __all__ = ["FrameDetections", "frame", "gather", "track_frames"]
 class FrameDetections(Record):
     """The detections (n,) of one frame, which may have none; columns are as in `DetectionTable`.
 
-    ``detections`` are the ``numbers`` there. Without ``described``, no description was copied.
+    There, ``detections`` are ``numbers``. If ``described`` is None, no description was copied.
     """
 
     topic: str
@@ -41,7 +41,10 @@ def frame(
     posterior: ArrayLike = (0.9, 0.1),
     **changes: Any,
 ) -> FrameDetections:
-    """Return frame ``k``, at k / 10 seconds by default, with equal objects at some positions."""
+    """Return frame ``k``, at k / 10 seconds by default, with equal objects at ``centers`` (n, 3).
+
+    ``changes`` are other fields of the frame.
+    """
     places = np.reshape(np.asarray(centers, float), (-1, 3))
     n = len(places)
     found = FrameDetections(

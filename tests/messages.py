@@ -31,7 +31,7 @@ def header(stamp: int, frame_id: str = "camera") -> Any:
 
 
 def image(stamp: int, depth: Any, encoding: str = "16UC1", frame_id: str = "camera") -> Any:
-    """Make a raw depth image from (h, w)."""
+    """Make a raw depth image from an array (h, w) of the type of its encoding."""
     h, w = depth.shape
     data = np.frombuffer(np.ascontiguousarray(depth).tobytes(), np.uint8)
     return make(IMAGE, header(stamp, frame_id), h, w, encoding, 0, depth.itemsize * w, data)
@@ -41,7 +41,7 @@ def info(stamp: int, camera: Camera = CAMERA, d: Iterable[float] = ()) -> Any:
     """Make the calibration of a pinhole camera, with distortion ``d``."""
     k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1], np.float64)
     p = np.insert(k, (3, 6, 9), 0.0)
-    roi = make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)  # a message
+    roi = make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
     size = (camera.height, camera.width)
     return make(
         INFO,
@@ -59,7 +59,7 @@ def info(stamp: int, camera: Camera = CAMERA, d: Iterable[float] = ()) -> Any:
 
 
 def cloud(stamp: int, points: Any, **changes: Any) -> Any:
-    """Make a cloud of plain float32 coordinates from (h, w, 3)."""
+    """Make a cloud of float32 coordinates from points (h, w, 3); ``changes`` are other fields."""
     h, w = points.shape[:2]
     data = np.frombuffer(np.ascontiguousarray(points, "<f4").tobytes(), np.uint8)
     fields = [make("sensor_msgs/msg/PointField", n, 4 * k, 7, 1) for k, n in enumerate("xyz")]
@@ -77,7 +77,10 @@ def write(
     empty: Iterable[tuple[str, str]] = (),
     **options: Any,
 ) -> Path:
-    """Write messages given as topic, log time, message or bytes, and ``empty`` topics."""
+    """Write messages given as topic, log time, and message or (type, bytes).
+
+    ``empty`` holds topic and type of topics without messages, ``options`` those of the writer.
+    """
     with mcap_writer(path, **options) as writer:
         channels = McapChannels(writer, STORE)
         for topic, kind in empty:
@@ -98,7 +101,7 @@ def wavy_depth(camera: Camera = CAMERA) -> Any:
 
 
 def organized_points(depth: Any, camera: Camera = CAMERA) -> Any:
-    """Return the points (h, w, 3) of a depth image in millimetres, metres."""
+    """Return the points (h, w, 3), in metres, of a depth image in millimetres."""
     frame = Frame("", 0, 0, 0, "", depth=depth / np.float32(1000), camera=camera)
     return frame.xyz().reshape(*depth.shape, 3)
 

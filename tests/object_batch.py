@@ -31,7 +31,7 @@ class Report:
     """The outcome of a batch.
 
     ``made`` counts how often each recording became a run; ``left`` names the objects in the bucket
-    that belong to neither runs nor manifest.
+    that belong to neither runs nor manifest; ``refused`` counts refused requests.
     """
 
     code: int
@@ -56,7 +56,10 @@ def fill(count: int, folder: Path) -> None:
 
 
 def run(count: int, folder: Path, *, refused: float) -> Report:
-    """Process a number of recordings; kill a worker, then the scheduler and all workers."""
+    """Process a number of recordings; kill a worker, then the scheduler and all workers.
+
+    ``refused`` is the fraction of requests that the storage refuses.
+    """
     with object_storage(folder / "log", refused=refused) as log:
         fill(count, folder)
         address = free_address()

@@ -57,7 +57,10 @@ def serve(share: float, log: Path) -> None:
 
 @contextmanager
 def object_storage(log: Path, *, refused: float = 0.0, bucket: str = "lab") -> Iterator[Path]:
-    """Serve an empty bucket; name the server in the environment, which processes inherit."""
+    """Serve an empty bucket; environment variables, which processes inherit, name the server.
+
+    Provide the ``log`` of the requests, of which a fraction is ``refused``.
+    """
     import fsspec  # noqa: PLC0415  nothing else here needs it
     import pytest  # noqa: PLC0415  the same
 
@@ -86,7 +89,7 @@ def object_storage(log: Path, *, refused: float = 0.0, bucket: str = "lab") -> I
 
 
 def requests(log: Path, method: str, ending: str) -> list[str]:
-    """Return the paths of the granted requests, by method and ending of the path."""
+    """Return the paths of granted requests with this method and ending of the path."""
     lines = [line.split() for line in log.read_text("utf-8").splitlines()]
     return [
         path

@@ -270,7 +270,7 @@ def distorted(path: Path, *, strong: bool) -> Path:
 
 
 def foreign(path: Path) -> Path:
-    """Add channels of other programs: a service event, and unknown encodings and schemas."""
+    """Write the table with channels of other programs: unknown encodings and schemas."""
     path /= "a.mcap"
     with mcap_writer(path) as writer:
         broken = writer.register_schema("my/srv/Do_Event", "ros2msg", b"service_msgs/Nothing info")
@@ -313,7 +313,7 @@ def late_transforms(path: Path) -> Path:
 
 
 def absurd_numbers(path: Path) -> Path:
-    """Add JSON messages whose numbers fit in no type, or stand where lists belong."""
+    """Write the table with JSON messages whose numbers fit no type, or stand in place of lists."""
     huge = 10**400
     time = {"sec": huge, "nanosec": 0}
     zeros = dict.fromkeys("xyzw", 0)
@@ -340,7 +340,7 @@ def absurd_numbers(path: Path) -> Path:
 
 
 def hostile_chunk(path: Path) -> Path:
-    """Let the first chunk claim to hold 10^9 bytes."""
+    """Write the table; its first chunk claims to hold 10^9 bytes."""
     found = mcap(path, compression=CompressionType.ZSTD, chunk_size=1)
     data = bytearray(found.read_bytes())
     at = 8 + 9 + struct.unpack_from("<Q", data, 9)[0]
@@ -361,7 +361,7 @@ def bad_frames(path: Path) -> Path:
 
 
 def fox(path: Path, encoding: str) -> Path:
-    """Write the table in messages of Foxglove."""
+    """Write the table as Foxglove point clouds."""
     items = []
     for k, view in enumerate(back_and_forth(FRAMES)):
         names = [{"name": n, "offset": 4 * j, "type": 7} for j, n in enumerate("xyz")]

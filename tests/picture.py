@@ -37,7 +37,7 @@ MIDDLES = {
     "rehearsal": 570,
     "runs": 740,
 }
-"""Positions of boxes with which no arrow runs behind a box; other layers are filled evenly."""
+"""Horizontal centres of boxes, so that no arrow runs behind a box; others are spaced evenly."""
 FIRST = ("schemas", "colour", "depth_fusion")
 LAST = ("tracking", "recordings", "simulation")
 """Boxes at the left and right end of their layers; the others are in alphabetical order."""

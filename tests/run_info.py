@@ -8,7 +8,7 @@ __all__ = ["run_info"]
 
 
 def run_info(**entries: Any) -> Any:
-    """Return a complete run.json; ``entries`` replace its own, or parts of them."""
+    """Return a complete run.json; ``entries`` replace its own, or are merged into its dicts."""
     complete: dict[str, Any] = {
         "id": "0123456789abcdef",
         "work": "",

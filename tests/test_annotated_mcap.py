@@ -46,7 +46,7 @@ RUN = {"version": "1", "counts": {"frames": 3}}
 def test_copying_a_shrinking_recording_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, in_kernel: bool
 ) -> None:
-    """Space for the copy is reserved first: missing bytes would read as zeros."""
+    """Space for the copy is reserved first, so bytes that are missing would read as zeros."""
 
     def refuse(*_: object) -> int:
         raise OSError(errno.EXDEV, "across file systems")
@@ -120,7 +120,7 @@ def annotate(source: Path, target: Path, **options: Any) -> None:
 def test_recording_that_cannot_be_copied_gives_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A thread copies it; zeros in place of its messages would look like a complete file."""
+    """A thread copies the recording: without its error, a file of zeros would look complete."""
 
     def fill_disk(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -160,7 +160,7 @@ def test_original_messages_stay_byte_for_byte(tmp_path: Path, compression: Compr
 
 
 def test_other_readers_accept_the_file(tmp_path: Path) -> None:
-    """The writer makes summary, offsets and checksums without a library."""
+    """Summary, offsets and checksums are written without a library; readers reject wrong ones."""
     target = tmp_path / "out.mcap"
     annotate(write_mcap(tmp_path / "a.mcap"), target)
 
@@ -191,16 +191,16 @@ def test_other_readers_accept_the_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("markers", [False, True])
 def test_original_channels_keep_their_ids(tmp_path: Path, *, markers: bool) -> None:
-    """Ids may have gaps; a duplicate would mix the messages of two topics."""
+    """Channel ids may have gaps; an id given twice would mix the messages of two topics."""
     source, target, text = tmp_path / "a.mcap", tmp_path / "out.mcap", b"string data"
     with mcap_writer(source) as writer:
         for k, topic in enumerate(("/first", "/gone", "/points", "/last")):
             schema = writer.register_schema(STRING, "ros2msg", text + bytes(k))
             channel = writer.register_channel(topic, "cdr", schema)
             if topic != "/gone":
-                # Before and after all annotations: the times of the file are its own.
+                # Before and after all annotations, so that the file begins and ends with these.
                 writer.add_message(channel, EPOCH + (k - 1) * SECOND, string(topic), EPOCH, k)
-        for kind in ("channels", "schemas"):  # the library itself leaves nothing out
+        for kind in ("channels", "schemas"):  # gaps in the ids, which the library never leaves
             vars(writer)[f"_Writer__{kind}"].pop(2)
     annotate(source, target, markers=markers)
 
@@ -314,7 +314,7 @@ def test_truncated_recording_is_rewritten(tmp_path: Path) -> None:
 
 
 def test_ros1_messages_of_unfinished_mcap_stay_byte_for_byte(tmp_path: Path) -> None:
-    """Only those of bags are converted: the other channels of the file may need ROS 1."""
+    """Only bags are converted to ROS 2: other channels of an MCAP file may need ROS 1."""
     source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
     data = b"\x05\0\0\0hello"
     with mcap_writer(source, "ros1", finish=False) as writer:
@@ -331,7 +331,7 @@ def test_ros1_messages_of_unfinished_mcap_stay_byte_for_byte(tmp_path: Path) -> 
 
 
 def test_both_definitions_of_a_type_are_kept(tmp_path: Path) -> None:
-    """Recordings of two robots, merged and cut: each topic keeps its own definition."""
+    """Robots may define a type differently: in merged recordings, each topic needs its own."""
     texts = {"/a": b"uint32 a", "/b": b"uint32 a\nuint32 b"}
     source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
     with mcap_writer(source, finish=False) as writer:
@@ -395,7 +395,7 @@ def ros1_messages() -> Iterator[tuple[str, str, Any]]:
     header = STORE1.types["std_msgs/msg/Header"](7, time, "frame")
     yield "/header", "std_msgs/msg/Header", header
     size = (np.zeros(0), np.arange(9.0), np.zeros(9), np.zeros(12), 0, 0)
-    roi = STORE1.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)  # a message
+    roi = STORE1.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     info = STORE1.types["sensor_msgs/msg/CameraInfo"](header, 4, 3, "plumb_bob", *size, roi)
     yield "/info", "sensor_msgs/msg/CameraInfo", info
     STORE1.register(
@@ -439,9 +439,9 @@ def test_ros1_bag_is_converted_to_ros2(tmp_path: Path) -> None:
 
 
 def test_ros1_type_that_ros2_has_extended_keeps_its_definition(tmp_path: Path) -> None:
-    """Markers have textures in ROS 2: read as such, the end of a recorded one is missing.
+    """Markers have more fields in ROS 2: with that definition, a recorded one ends too early.
 
-    An array of them has the same fields in both.
+    A MarkerArray has the same fields in both, but contains markers.
     """
     source, target = tmp_path / "a.bag", tmp_path / "out.mcap"
     kind, types = "visualization_msgs/msg/Marker", STORE1.types
@@ -471,7 +471,7 @@ def test_ros1_type_that_ros2_has_extended_keeps_its_definition(tmp_path: Path) -
 
 
 def test_names_of_ros1_fields_are_allowed_in_ros2(tmp_path: Path) -> None:
-    """Strict readers refuse the whole file otherwise; drivers of Franka robots write O_T_EE."""
+    """ROS 2 allows no capitals, as in O_T_EE of Franka robots; strict readers refuse the file."""
     source, target = tmp_path / "a.bag", tmp_path / "out.mcap"
     kind, store = "lab/msg/State", get_typestore(Stores.ROS1_NOETIC)
     text = "float64[2] O_T_EE\nint8 isOn\nint8 a\nint8 A\nint8 b2C_\nint8 TYPE=5"
@@ -488,7 +488,7 @@ def test_names_of_ros1_fields_are_allowed_in_ros2(tmp_path: Path) -> None:
 
 
 def test_topics_of_one_type_share_its_conversion(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A robot may have thousands of topics, and a definition takes milliseconds."""
+    """A robot may have thousands of topics, and parsing a definition takes milliseconds."""
     asked: list[Channel] = []
 
     def counted(channel: Channel) -> Any:
@@ -512,7 +512,7 @@ def test_topics_of_one_type_share_its_conversion(monkeypatch: pytest.MonkeyPatch
 
 
 def test_topics_without_messages_are_kept(tmp_path: Path) -> None:
-    """They show that a camera was there, although it sent nothing."""
+    """A topic without messages shows that a camera was there, although it sent nothing."""
     source, target = tmp_path / "a.bag", tmp_path / "out.mcap"
     with BagWriter(source) as writer:
         connection = writer.add_connection("/text", STRING, typestore=STORE1)

@@ -1,4 +1,4 @@
-"""Tests of annotations of a rotated box in every encoding; all numbers differ, so swaps show."""
+"""Tests of annotations of a rotated box in every encoding; all numbers differ, to notice swaps."""
 
 import json
 from collections.abc import Iterable
@@ -86,7 +86,7 @@ def numbers(record: Any, names: str) -> list[float]:
 
 
 def rotation_error(quaternion: Any) -> float:
-    """Return the angle between a quaternion (x, y, z, w) and that of the box, radians."""
+    """Return the angle in radians between a quaternion message and the rotation of the box."""
     return float((Rotation.from_quat(numbers(quaternion, "xyzw")) * ROTATION.inv()).magnitude())
 
 
@@ -97,7 +97,7 @@ def check_box(pose: Any, size: Any) -> None:
 
 
 def test_label_is_above_top_of_box() -> None:
-    """With a transposed rotation it would be beside a tilted box."""
+    """With a transposed rotation, the label would be beside a tilted box."""
     assert_allclose(text_position(BOX), ABOVE, atol=1e-12)
 
 
@@ -221,7 +221,7 @@ def test_added_messages_are_found_by_time(tmp_path: Path) -> None:
 
 
 def test_unordered_messages_are_found_by_time(tmp_path: Path) -> None:
-    """Messages of two sensors arrive interleaved."""
+    """Frames of two sensors are not in order of time; a seek must find them nevertheless."""
     offsets = (50, 20, 90, 70)
     frames = [replace(FRAME, index=k, log_time_ns=EPOCH + t) for k, t in enumerate(offsets)]
     with annotated(tmp_path, frames).open("rb") as file:
@@ -250,7 +250,7 @@ def test_statistics_cover_times_of_all_messages(
 ) -> None:
     """Players take the length from the statistics and would not play messages beyond it.
 
-    The messages of the original are at 0 to 8.
+    The original messages are at 0 to 8 ns, the annotations at ``offsets``.
     """
     frames = [replace(FRAME, index=k, log_time_ns=EPOCH + t) for k, t in enumerate(offsets)]
     summary = summary_of(annotated(tmp_path, frames))
@@ -261,7 +261,7 @@ def test_statistics_cover_times_of_all_messages(
 
 
 def test_object_visible_to_another_sensor_is_not_deleted(tmp_path: Path) -> None:
-    """Two sensors share the tracks of a scene: the last frame with an object ends it."""
+    """Two sensors share tracks: an object that only one of them has lost must stay."""
 
     def frame_of(topic: str, k: int, *, visible: bool) -> AnnotationFrame:
         boxes = (BOX,) if visible else ()
@@ -292,7 +292,7 @@ def image_messages(encoding: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "json", "protobuf"])
 def test_image_annotations_are_equal_in_every_encoding(encoding: str) -> None:
-    """Boxes in the colour of their category, readable on any image; type 2 is a closed line."""
+    """Boxes have the colour of their category, labels a background; type 2 is a closed line."""
     message = image_messages(encoding)["/shapecat/image_annotations"]
     expected = [
         ("bowl", "#7 bowl 0.63", 11.0, [(31, 44), (151, 44), (151, 110), (31, 110)]),
@@ -316,7 +316,7 @@ def test_image_annotations_are_equal_in_every_encoding(encoding: str) -> None:
 
 
 def test_each_of_several_cameras_has_its_annotations(tmp_path: Path) -> None:
-    """Viewers draw all messages of a channel on an image: also the boxes of other cameras."""
+    """Viewers draw all messages of a channel: in a shared one, also the boxes of other cameras."""
     images = [
         ImageFrame(topic, STAMP, STAMP + k, "colour", IMAGE_BOXES[:1] * boxes)
         for k, (topic, boxes) in enumerate([("/l/rgb", 1), ("r/rgb", 2), ("/l/rgb", 3)])

@@ -127,7 +127,7 @@ def test_colour_masks_cover_their_objects(page_folder: Path) -> None:
 
 
 def test_frame_with_colour_can_be_sent_to_another_process(page_folder: Path) -> None:
-    """A pool of processes refused frames with colour: their images are views of other memory."""
+    """A pool of processes refused frames with colour, since views of memory cannot be pickled."""
     run = shapecat.open_run(page_folder / "results" / "demo")
     frame = next(run.frames(recording=page_folder / "demo.mcap"))
     (_, message), *_ = read_ros(page_folder / "demo.mcap", "/camera/color/image_raw/compressed")
@@ -251,7 +251,7 @@ def test_masked_values_are_missing(image: Any) -> None:
 
 
 def test_points_of_the_caller_are_not_changed() -> None:
-    """Incomplete rows become NaN, in a copy: those of the caller may be used again."""
+    """Incomplete rows become NaN in a copy, as the caller may use the points again."""
     points = np.ones((5, 3), np.float32)
     points[2, 1] = np.inf
     points.flags.writeable = False
@@ -382,7 +382,7 @@ def test_crop_of_image_is_perceived() -> None:
 def test_moved_recording_may_be_in_home_folder(
     page_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As for all other paths, no shell replaces the ``~``."""
+    """In Python, no shell replaces the ``~`` of a path."""
     monkeypatch.setenv("HOME", str(page_folder))
     run = shapecat.open_run("~/results/demo")
 
@@ -399,7 +399,7 @@ def test_model_may_be_in_home_folder(
 
 
 def test_merged_tracks_are_described_as_one(guessed_run: Path, tmp_path: Path) -> None:
-    """Its frames show one object, so that the description of the run counted one too many."""
+    """Frames show merged tracks as one object, so the description of the run must not count two."""
     folder = tmp_path / "run"
     shutil.copytree(guessed_run, folder)
     count = len(shapecat.open_run(folder).labels)
@@ -415,7 +415,7 @@ def test_merged_tracks_are_described_as_one(guessed_run: Path, tmp_path: Path) -
 
 
 def test_frames_of_one_topic_are_read(page_folder: Path) -> None:
-    """A name alone is read as one topic, as `process` takes it."""
+    """A single name is one topic, as for `process`, and no list of letters."""
     with shapecat.open_recording(page_folder / "demo.mcap") as recording:
         frame = next(iter(recording.frames("/camera/depth/image_raw")))
 
@@ -425,7 +425,7 @@ def test_frames_of_one_topic_are_read(page_folder: Path) -> None:
 @pytest.mark.parametrize("container", ["mcap", "ros1", "ros2"])
 @pytest.mark.parametrize("read", [0, 1])
 def test_frames_of_closed_recording_are_refused(tmp_path: Path, container: str, read: int) -> None:
-    """Those of a ROS 2 bag ended early, as if the bag had no more; others gave tracebacks."""
+    """Frames of a ROS 2 bag would end, as if there were no more; other formats gave a traceback."""
     path = record(tmp_path / "a", 5, container=container)
     with shapecat.open_recording(path) as recording:
         frames = recording.frames()
@@ -491,7 +491,7 @@ def test_model_is_read_once_until_its_file_changes(
 
 
 def test_model_of_another_version_is_refused(tmp_path: Path) -> None:
-    """With other components it ended in a traceback, with reordered ones in wrong categories."""
+    """Other descriptor components would give a traceback, reordered ones wrong categories."""
     model = load_model()
     reordered = (*model.descriptor_names[1:], model.descriptor_names[0])
     save_model(tmp_path / "old.npz", replace(model, descriptor_names=reordered))
@@ -527,7 +527,7 @@ def test_table_columns_become_arrays(page_folder: Path) -> None:
 
 
 def test_name_of_one_column_is_no_list_of_letters(tmp_path: Path) -> None:
-    """The error said that there is no column `a`."""
+    """A name read as a list of letters gives a misleading error about a column `a`."""
     pq.write_table(pa.table({"area_m2": [0.5, 2.0], "plane": [0, 1]}), tmp_path / "t.parquet")
     table = Table(tmp_path / "t.parquet")
 
@@ -537,7 +537,7 @@ def test_name_of_one_column_is_no_list_of_letters(tmp_path: Path) -> None:
 
 
 def test_names_may_come_from_a_generator(tmp_path: Path) -> None:
-    """They were read twice, so that tables had no columns, and recordings no frames."""
+    """A generator can be read only once; read twice, it gives no columns and no frames."""
     pq.write_table(pa.table({"area_m2": [0.5], "plane": [0]}), tmp_path / "t.parquet")
     path = record(tmp_path / "a.mcap", 3)
 
@@ -562,7 +562,7 @@ def test_lists_of_text_become_an_array(tmp_path: Path) -> None:
 def test_arrays_of_run_without_objects_join_those_of_others(
     page_folder: Path, tmp_path: Path
 ) -> None:
-    """One empty recording among many ended the joining of their descriptors in an error."""
+    """One recording without objects among many would make joining their descriptors fail."""
     flat = messages.image(EPOCH, np.full((48, 64), 2.0))
     items = [("/d/camera_info", EPOCH, messages.info(EPOCH)), ("/d/image", EPOCH, flat)]
     recording = messages.write(tmp_path / "a.mcap", items)
@@ -579,7 +579,7 @@ def test_arrays_of_run_without_objects_join_those_of_others(
 
 
 def test_lists_of_different_lengths_keep_their_type(tmp_path: Path) -> None:
-    """An object without edges had a list of floats, which is no index into its neurons."""
+    """As floats, the empty list of an object without edges could not index its neurons."""
     edges = pa.array([[0, 1, 1, 2], [], [0, 3]], pa.list_(pa.uint16()))
     neurons = pa.array([[0.5, 1.5, 2.5], [], [3.5]], pa.list_(pa.float32()))
     pq.write_table(pa.table({"edges": edges, "neurons": neurons}), tmp_path / "t.parquet")
@@ -604,7 +604,7 @@ def test_null_list_becomes_row_of_nan(tmp_path: Path) -> None:
 
 
 def test_wrong_settings_and_folders_are_refused(page_folder: Path, tmp_path: Path) -> None:
-    """An option without effect, as labels that are not discarded, would go unnoticed."""
+    """A misspelt option, or one without effect, would go unnoticed."""
     with pytest.raises(ConfigError, match=r"did you mean detection\.max_range_m"):
         shapecat.process(page_folder / "demo.mcap", tmp_path, detection={"max_range": 1.0})
     with pytest.raises(OutputError, match="another input, model or settings"):
@@ -646,7 +646,7 @@ def test_frames_that_the_command_refuses_are_refused(
 
 
 def test_times_may_be_numbers_of_numpy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They could not be written to run.json, after all frames had been processed."""
+    """NumPy's numbers cannot be written to run.json; this failed after processing all frames."""
     jobs: list[Any] = []
     times: Any = {"start_s": np.float32(0.5), "end_s": np.int64(2)}
     monkeypatch.setattr("shapecat.pipeline.process", lambda job, *_, **__: jobs.append(job))
@@ -658,7 +658,7 @@ def test_times_may_be_numbers_of_numpy(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_options_of_process_reach_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each of them is named again on its way, and one that is forgotten has its default."""
+    """Options are passed on one by one; one that is forgotten would silently have its default."""
     jobs: list[tuple[Any, int]] = []
     monkeypatch.setattr(
         "shapecat.pipeline.process", lambda job, *_, cores: jobs.append((job, cores))
@@ -697,7 +697,7 @@ def test_run_of_the_current_folder_has_its_name(
 
 
 def test_process_accepts_single_topic_and_up_vector(page_folder: Path, tmp_path: Path) -> None:
-    """A topic was read as a list of letters, and a list of numbers ended in a traceback."""
+    """A single topic was read as a list of letters, and an up vector ended in a traceback."""
     plain: Any = {"every": 8, "mcap": False, "rrd": False}
     topic, up = "/camera/depth/image_raw", (0, -0.75, -0.5)
 

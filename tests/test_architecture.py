@@ -137,7 +137,7 @@ def test_no_print_eval_or_bare_except() -> None:
 
 
 def test_only_documented_parts_of_numba_are_used() -> None:
-    """Undocumented parts of its compiler change with any release."""
+    """Undocumented parts of numba's compiler change with any release."""
     documented = {"numba", "numba.extending"}
     for path in FILES:
         for node in nodes(path):
@@ -162,7 +162,7 @@ def test_help_loads_no_heavy_library() -> None:
 def test_processing_loads_no_library_too_early() -> None:
     """Before the first frame, processing must load neither slow libraries nor display libraries.
 
-    SciPy's images, data frames and Protocol Buffers take longer to load than all of ours. Open3D
+    scipy.ndimage, pandas and Protocol Buffers take longer to load than all of shapecat. Open3D
     needs libEGL and libX11, which a server or a container does not have.
     """
     late = {"scipy.ndimage", "scipy.optimize", "pandas", "pyarrow.compute"}
@@ -181,7 +181,10 @@ def test_processing_loads_no_library_too_early() -> None:
 def test_commands_do_not_load_libraries_that_others_ask_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Arrow with its first array, numba with its first kernel: half and a tenth of a second."""
+    """Arrow would load pandas for its first array, numba SciPy for its first kernel.
+
+    This takes half a second and a tenth of a second.
+    """
     monkeypatch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)  # `make coverage` sets it
     code = (
         "import types, pyarrow, numpy as np, shapecat.__main__ as entry;"
@@ -194,7 +197,7 @@ def test_commands_do_not_load_libraries_that_others_ask_for(
 
 
 def test_kernels_do_without_linear_algebra_of_numpy() -> None:
-    """Commands keep numba from loading SciPy for it, so that such a kernel would not compile."""
+    """Commands keep numba from loading SciPy, without which such a kernel does not compile."""
     for path in (path for path in FILES if "@kernel" in path.read_text("utf-8")):
         for function in nodes(path):
             decorators = getattr(function, "decorator_list", [])
@@ -215,7 +218,7 @@ def test_architecture_page_is_short() -> None:
 
 
 def test_architecture_picture_is_up_to_date() -> None:
-    """`make picture` redraws it."""
+    """`make picture` redraws the picture after a change of imports."""
     from tests.picture import PICTURE, draw  # noqa: PLC0415  it imports this file
 
     assert PICTURE.read_text("utf-8") == draw()
@@ -226,7 +229,7 @@ def test_loaded_libraries_are_detected() -> None:
 
 
 def test_inlined_kernel_has_one_caller_with_same_arithmetic() -> None:
-    """A second caller would compile it again; other fast-math flags give other numbers."""
+    """A second caller would compile the kernel again; other fast-math flags give other numbers."""
     flags, calls = kernels()
     inlined = {name: own for name, own in flags.items() if own.get("inline")}
     assert inlined
@@ -235,7 +238,7 @@ def test_inlined_kernel_has_one_caller_with_same_arithmetic() -> None:
 
 
 def test_inner_kernel_is_called_only_by_kernels() -> None:
-    """Python would silently run it uncompiled, a hundred times slower."""
+    """Called from Python, it would silently run uncompiled, a hundred times slower."""
     flags, calls = kernels()
     inner = [name for name, own in flags.items() if own.get("inner")]
     assert inner

@@ -48,7 +48,7 @@ FRAMES = 16
 
 
 class Watcher:
-    """Collects reports of progress, and may react to them."""
+    """Collects the folders that report progress; calls ``act`` with each folder and phase."""
 
     def __init__(self, act: Callable[[str, str], None] | None = None) -> None:
         self.reported: set[str] = set()
@@ -162,7 +162,7 @@ def test_complete_recordings_are_not_opened_again(
 
 
 def test_changed_work_is_not_complete(recordings: Path, one_by_one: Path) -> None:
-    """Changed content, settings or model, or a missing output, must be noticed cheaply."""
+    """With changed content, options or settings, or a missing output, work is not complete."""
 
     def status(job: Job) -> str:
         with plan_batch(job, [str(recordings)], str(one_by_one)) as batch:
@@ -197,7 +197,7 @@ def test_two_processes_give_same_tables(
 
 @pytest.mark.usefixtures("all_awake")
 def test_processes_sharing_frames_give_same_tables(recordings: Path, tmp_path: Path) -> None:
-    """They share blocks of frames, so there must be several."""
+    """Processes share blocks of frames; with blocks of two frames, both processes have some."""
     from shapecat.pipeline import process  # noqa: PLC0415  beside its only use
 
     source, settings = recordings / "monday/log.mcap", Settings(reuse_frames=2)
@@ -241,7 +241,7 @@ def test_takes_are_not_mixed_in_one_run(tmp_path: Path, gap_s: float, found: int
 
 
 def test_metadata_of_a_data_set_makes_no_bag(tmp_path: Path) -> None:
-    """Its takes were mixed in one run, and takes below it, or bags of ROS 1, not found at all."""
+    """Taken for a bag, a folder gives one run of mixed takes; subfolders are not searched."""
     takes = {tmp_path / name for name in ("monday.mcap", "tuesday.bag", "more/wednesday.mcap")}
     (tmp_path / "more").mkdir()
     for take in takes:
@@ -257,7 +257,10 @@ def test_metadata_of_a_data_set_makes_no_bag(tmp_path: Path) -> None:
 
 
 def test_folders_are_searched_and_bags_stay_whole(tmp_path: Path) -> None:
-    """A shell expands folder/** to folders, their contents, and files of other programs."""
+    """A shell expands folder/** to folders, their contents, and files of other programs.
+
+    Each recording must be found once.
+    """
     bags = (
         "bag/bag_0.db3",
         "bag/metadata.yaml",
@@ -353,7 +356,7 @@ class OtherVersion(Executor):
     """An executor whose workers have another version of shapecat than the command."""
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Run the call at once."""
+        """Run the call at once, in another version."""
         future: Future[Any] = Future()
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("shapecat.batch.runs.__version__", "9.9")
@@ -362,7 +365,7 @@ class OtherVersion(Executor):
 
 
 def test_workers_of_another_version_are_refused(tmp_path: Path) -> None:
-    """They would ignore options that they do not know, without a word."""
+    """Workers of another version would silently ignore options that they do not know."""
     (tmp_path / "a.mcap").write_bytes(b"\x89MCAP")
     with plan_batch(Job(Path(), Path()), [str(tmp_path / "a.mcap")], str(tmp_path)) as batch:
         (outcome,) = process_on(OtherVersion(), batch.tasks, Watcher())
@@ -389,7 +392,7 @@ def test_model_that_was_replaced_meanwhile_is_refused(tmp_path: Path) -> None:
 
 
 def test_recording_that_only_waited_has_one_try(recordings: Path, tmp_path: Path) -> None:
-    """A scheduler that restarts drops all queued tasks, possibly many times."""
+    """A scheduler may restart many times and drop queued tasks, which were never tried."""
 
     class Forgetful(Fragile):
         def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -441,7 +444,7 @@ def test_interrupted_batch_ends_and_can_be_resumed(
 ) -> None:
     """Ctrl-C gives exit code 130 and leaves no process; a second run completes the rest.
 
-    Until then, events come from two processes at once.
+    Until then, two processes print events at once, which must not be mixed within a line.
     """
     words = ("process", str(recordings), "--out", str(tmp_path), "--no-rrd", "--jobs")
     running = subprocess.Popen(

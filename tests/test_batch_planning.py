@@ -91,7 +91,7 @@ def test_unreadable_file_is_not_skipped(source: Path, monkeypatch: pytest.Monkey
 
 
 def test_recordings_are_known_by_their_first_bytes(tmp_path: Path) -> None:
-    """A user who gives a recording any name would miss it among the others."""
+    """A recording without the usual ending of its name would be missing from the results."""
     starts = {"a": b"\x89MCAP0\r\n", "b": b"#ROSBAG V2.0\n", "c": b"SQLite format 3\0"}
     for name, content in {**starts, "d": b"SQLite", "e": b"MCAP", "f.mcap": b""}.items():
         (tmp_path / name).write_bytes(content)
@@ -136,7 +136,7 @@ def test_compressed_recordings_in_a_folder_are_named(
 
 
 def test_compressed_recordings_in_storage_are_named(caplog: pytest.LogCaptureFixture) -> None:
-    """As in a folder of this machine; those in a bag are parts of it."""
+    """Compressed recordings would be missing without a word; in a bag, files may be compressed."""
     names = ("a.mcap", "b.mcap.zstd", "c.bag.gz", "bag/metadata.yaml", "bag/bag_0.db3.zstd")
     for name in names:
         with fsspec.open(f"memory://packed/{name}", "wb") as file:
@@ -154,7 +154,7 @@ def test_compressed_recordings_in_storage_are_named(caplog: pytest.LogCaptureFix
 
 
 def test_files_of_a_bag_are_not_counted_as_skipped(tmp_path: Path) -> None:
-    """A shell pattern may list them beside their bag."""
+    """A shell pattern may list the files of a bag beside the bag."""
     bag, note = tmp_path / "bag", tmp_path / "note.txt"
     bag.mkdir()
     files = [bag / "bag_0.db3", bag / "metadata.yaml", note]
@@ -255,7 +255,7 @@ def test_content_is_compared_if_copy_keeps_times(source: Path) -> None:
     """After `cp -p` or `rsync -t`, only the inode time of another recording differs."""
     known, stat = planned(source)["input"], source.stat()
     known["digest"] = content_digest(source)
-    while source.stat().st_ctime_ns == stat.st_ctime_ns:  # its clock ticks every few milliseconds
+    while source.stat().st_ctime_ns == stat.st_ctime_ns:  # until the file system sets a new time
         source.write_bytes(b"recordinG")
         os.utime(source, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
@@ -304,7 +304,7 @@ def test_digest_covers_the_whole_recording(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("whole", [True, False])
 def test_write_ahead_log_is_content_of_its_database(tmp_path: Path, *, whole: bool) -> None:
-    """Its messages are read, so results without them are those of another recording."""
+    """Messages in the log are read, so results without them are those of another recording."""
     base, log = tmp_path / "bag" / "a.db3", tmp_path / "bag" / "a.db3-wal"
     base.parent.mkdir()
     base.write_bytes(b"database")
@@ -356,7 +356,7 @@ def test_results_at_url_must_match_input_and_work(
 def test_bag_is_the_same_recording_through_links_and_within(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A killed recorder leaves no metadata: named by its only part, the bag got a second run."""
+    """A bag that a killed recorder left without metadata would get another run for each name."""
     bag = tmp_path / "data" / "walk"
     bag.mkdir(parents=True)
     (bag / "walk_0.mcap").write_bytes(b"\x89MCAP")
@@ -386,7 +386,7 @@ def test_bag_is_the_same_recording_through_links_and_within(
 def test_pattern_that_no_shell_expanded_is_expanded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pattern: str, found: list[str]
 ) -> None:
-    """A script that starts the command, or quotes, gave *does not exist*; at URLs it worked."""
+    """A quoted pattern, or one that a script passes, would be reported as a missing file."""
     names = ("a.mcap", "b[1].mcap", ".c.mcap", "n.txt", "bag/bag_0.mcap", "bag/bag_1.mcap")
     for name in (*names, "done/old.mcap", "done/run.json"):
         path = tmp_path / "in" / name
@@ -426,7 +426,7 @@ def test_recording_is_named_by_its_link(
 
 
 def test_recordings_of_equal_names_are_told_apart_by_folders_of_their_links(tmp_path: Path) -> None:
-    """The folder of the files they point to says nothing."""
+    """The folders of the files that the links point to have names that say nothing to a user."""
     for day, digest in (("monday", "3f9c0a"), ("tuesday", "b77e1d")):
         store, folder = tmp_path / "store" / digest[:2], tmp_path / day
         store.mkdir(parents=True)
@@ -511,7 +511,7 @@ def test_partial_run_resumes_with_other_outputs(source: Path, tmp_path: Path) ->
 
 
 def test_partial_run_resumes_with_other_tracking(source: Path, tmp_path: Path) -> None:
-    """Frames of hours would be discarded, or the command be refused, because of a gate."""
+    """Hours of perceived frames would be lost, or the command refused, because of a new gate."""
     job = Job(source, tmp_path / "lab", with_overrides(Settings(), ["tracking.gate_m=0.3"]))
     folder = partial_path(job.folder)
     partial(folder, planned(source))
@@ -526,7 +526,7 @@ def test_partial_run_resumes_with_other_tracking(source: Path, tmp_path: Path) -
 
 
 def test_partial_run_resumes_with_copy_of_its_recording(source: Path, tmp_path: Path) -> None:
-    """With the old file's times, the recording would seem changed and the work be discarded."""
+    """A copy has another time: taken for another recording, it would cost the work done so far."""
     folder, run = tmp_path / "half", planned(source)
     partial(folder, run)
     os.utime(source, (1, 1))
@@ -554,7 +554,7 @@ def test_partial_run_of_other_work_is_discarded(
 ) -> None:
     """Otherwise half of the tables would come from another model or version.
 
-    Hours of work are not lost because of another --end; they are if nothing can continue them.
+    Work that the old command could continue, as with another --end, is not discarded unasked.
     """
     job = Job(source, tmp_path / "lab")
     folder, run = partial_path(job.folder), planned(source)
@@ -648,7 +648,7 @@ def test_batch_notices_replaced_recording_with_same_times(source: Path, tmp_path
 
     before, stat = key(), source.stat()
     assert key() == before
-    while source.stat().st_ctime_ns == stat.st_ctime_ns:  # its clock ticks every few milliseconds
+    while source.stat().st_ctime_ns == stat.st_ctime_ns:  # until the file system sets a new time
         source.write_bytes(b"recordinG")
         os.utime(source, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
@@ -656,7 +656,7 @@ def test_batch_notices_replaced_recording_with_same_times(source: Path, tmp_path
 
 
 def test_key_of_bag_covers_all_its_files(tmp_path: Path) -> None:
-    """A bag whose last part was copied again, or arrived later, had complete results."""
+    """A bag whose last part was copied again, or arrived later, must not pass for complete."""
     bag = tmp_path / "bag"
     bag.mkdir()
     keys = []
@@ -723,7 +723,7 @@ def test_batch_notices_run_that_was_replaced_alone(
     name: str | None,
     topics: tuple[str, ...],
 ) -> None:
-    """A command for one recording, and Python, write no manifest."""
+    """A command for one recording, and Python, replace a run without a line in the manifest."""
     (source.parent / "other.mcap").write_bytes(b"another")
     out, job = tmp_path / "out", Job(Path(), Path(), topics=topics, mcap=False, rrd=False)
     (out / "lab").mkdir(parents=True)
@@ -753,7 +753,7 @@ def test_batch_notices_run_that_was_replaced_alone(
 def test_batch_notices_run_at_url_that_was_replaced(
     source: Path, monkeypatch: pytest.MonkeyPatch, there: Callable[..., Any] | None, status: str
 ) -> None:
-    """A command for one recording writes no manifest there, and one with shards another one."""
+    """A command for one recording writes no manifest there, and one with shards writes another."""
     (source.parent / "other.mcap").write_bytes(b"another")
     out, job = f"memory://replaced-{id(there)}", Job(Path(), Path())
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
@@ -785,7 +785,7 @@ def overwritten(sources: Path, out: Path, *, most: int = 9, **changes: Any) -> d
 def test_interrupted_overwriting_continues(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The command says that finished work is kept; another command replaces all of it."""
+    """Repeated after an interruption, a command keeps what it has finished; others replace all."""
     (source.parent / "other.mcap").write_bytes(b"another")
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
 
@@ -815,7 +815,7 @@ def test_interrupted_overwriting_continues(
 def test_overwriting_again_after_a_failure_replaces_all(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A damaged recording does not interrupt a command: the next one must not skip its runs."""
+    """A command with a damaged recording is not interrupted: given again, it replaces all runs."""
     (source.parent / "broken.mcap").write_bytes(b"damaged")
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
     begun: list[str] = []
@@ -852,7 +852,7 @@ def test_times_of_manifest_are_in_utc(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_full_disk_leaves_no_partial_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The next line would be appended to the part that fit."""
+    """The next line would be appended to the part of a line that fit on the disk."""
     path = tmp_path / "manifest.jsonl"
     Manifest(path).record([Entry("a", "a.mcap", "complete")])
     whole = path.read_bytes()
@@ -906,7 +906,7 @@ OURS = b'{"folder": "a", "recording": "a.mcap", "state": "comp'
 def test_manifest_of_another_program_is_refused(
     tmp_path: Path, place: str, content: bytes, *, is_ours: bool
 ) -> None:
-    """Lines were appended to it without a word, and at a URL it was replaced."""
+    """Lines would be appended to a file of another program, or at a URL replace it."""
     out = str(tmp_path) if place == "folder" else f"memory://manifests-{content[:60].hex()}"
     file = Path(out, "manifest.jsonl") if place == "folder" else Location(out) / "manifest.jsonl"
     file.write_bytes(content) if isinstance(file, Path) else file.write(content)
@@ -942,7 +942,7 @@ def test_entry_with_zero_tracks_is_not_read_as_unknown(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("part_bytes", [1, 10**6])
 def test_manifest_at_url_ends_as_one_file(monkeypatch: pytest.MonkeyPatch, part_bytes: int) -> None:
-    """It holds the last line of each recording, also of two written in the same millisecond."""
+    """The file has the last line of each recording, also of two lines of the same millisecond."""
     monkeypatch.setattr("shapecat.batch.manifest._PART_BYTES", part_bytes)
     place = f"memory://one-file-{part_bytes}"
     with RemoteManifest(place) as manifest:
@@ -1025,7 +1025,7 @@ def test_entries_of_other_work_are_replaced(source: Path, monkeypatch: pytest.Mo
 
 
 def test_earlier_outcome_is_known_without_a_manifest(tmp_path: Path) -> None:
-    """After its disk is full, the manifest is given up, but complete runs are still complete."""
+    """On a full disk, the manifest is given up, but complete runs must count as complete."""
     job = Job(Path("lab.mcap"), tmp_path / "lab")
     task: Any = SimpleNamespace(name="lab", job=job)
     missing = Ledger(None).earlier_outcome(task)
@@ -1039,7 +1039,7 @@ def test_earlier_outcome_is_known_without_a_manifest(tmp_path: Path) -> None:
 
 
 def test_run_stores_absolute_path(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is annotated and exported from another current folder."""
+    """A run may be annotated and exported from another current folder."""
     monkeypatch.chdir(source.parent)
 
     assert planned(Path(source.name))["input"]["path"] == str(source.resolve())
@@ -1084,7 +1084,7 @@ def test_other_frames_model_or_settings_are_other_work(
 ) -> None:
     """Results at a URL, and those of an interrupted --overwrite, are told apart by this key alone.
 
-    Other results would be kept; the same model under another name makes the same.
+    With an equal key, old results would be kept. A copy of the model does not change the key.
     """
     monkeypatch.chdir(source.parent)
     (source.parent / "other.mcap").write_bytes(b"another")
@@ -1128,14 +1128,14 @@ def test_content_key_changes_with_content_at_url(
 
 @pytest.mark.parametrize("name", ["Last-Modified", "Content-MD5", "Digest"])
 def test_content_key_changes_with_headers_of_a_web_server(name: str) -> None:
-    """Many send no ETag: a recording replaced by one of the same size had complete results."""
+    """Many send no ETag: a recording replaced by one of the same size would pass for complete."""
     assert content_key({"size": 7, name: "one"}) != content_key({"size": 7, name: "two"})
 
 
 def test_content_of_same_size_is_not_trusted(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A web server may tell the size of a recording alone, and nothing at all to a signed URL."""
+    """A web server may state only the size of a recording, or for a signed URL nothing at all."""
     (source.parent / "other.mcap").write_bytes(b"another")
     out, job = tmp_path / "out", Job(Path(), Path(), mcap=False, rrd=False)
     (out / "lab").mkdir(parents=True)
@@ -1152,7 +1152,7 @@ def test_content_of_same_size_is_not_trusted(
 
 
 def test_key_of_bag_at_url_covers_all_its_files() -> None:
-    """The storage may list them in any order."""
+    """The storage may list the files of a bag in any order."""
     keys = [_combined_key(keys) for keys in ("ab", "ac", "db", "ba")]
 
     assert len(set(keys)) == 3
@@ -1171,7 +1171,7 @@ def test_key_of_bag_at_url_covers_all_its_files() -> None:
 def test_lost_recording_counts_as_tried_if_it_had_started(
     source: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, *, begun: bool, tries: int
 ) -> None:
-    """Otherwise a recording that kills its machine would be tried for ever."""
+    """Otherwise a recording that kills its machine would be tried forever."""
     (source.parent / "other.mcap").write_bytes(b"another")
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
     out = str(source.parent / "out")
@@ -1244,7 +1244,7 @@ def test_largest_recordings_start_first(tmp_path: Path, monkeypatch: pytest.Monk
 def test_recording_is_complete_in_manifest_before_outcome_is_returned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A batch stopped at this moment must not repeat it."""
+    """A batch stopped at this moment must not repeat the recording."""
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
     counts = {"frames": 3, "tracks": {"cup": 2}}
 
@@ -1306,10 +1306,10 @@ def test_new_recording_does_not_get_existing_folder() -> None:
 def test_run_keeps_folder_when_recording_of_same_name_is_added(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str, name: str, state: str
 ) -> None:
-    """Otherwise it is processed again without its labels, and counted twice in each export.
+    """Otherwise the recording has a second run, without labels, and counts twice in each export.
 
-    run.json has the absolute path without links, however the user names the recording. Work of a
-    killed run would be orphaned, and a recording that fails be a new failure with each command.
+    run.json has the absolute path without links, however the user names the recording. Also, work
+    of a killed run would be orphaned, and each command would count another failed recording.
     """
     for day in ("monday", "tuesday"):
         (tmp_path / day).mkdir()
@@ -1335,7 +1335,7 @@ def test_run_keeps_folder_when_recording_of_same_name_is_added(
 
 
 def test_copy_of_run_keeps_its_name(tmp_path: Path) -> None:
-    """It would be overwritten instead of the run, if its name contains that of the recording."""
+    """A copy whose name ends like that of the run would be overwritten instead of the run."""
     for name in ("a copy of monday_lab", "monday_lab"):
         (tmp_path / "out" / name).mkdir(parents=True)
         path = str((tmp_path / "monday" / "lab.mcap").resolve())
@@ -1351,7 +1351,7 @@ def test_copy_of_run_keeps_its_name(tmp_path: Path) -> None:
 
 
 def test_recording_of_a_batch_keeps_its_name_alone(tmp_path: Path) -> None:
-    """To process it again by itself must not make a second run of it."""
+    """Processing a recording of a batch again, by itself, must not make a second run."""
     (tmp_path / "monday").mkdir()
     (tmp_path / "monday" / "lab.mcap").write_bytes(b"recording")
     name, out = "monday_lab", tmp_path / "out"
@@ -1396,7 +1396,7 @@ def test_run_at_url_keeps_folder_when_recording_of_same_name_is_added(
 
 
 def test_recording_at_url_keeps_the_folder_of_its_run() -> None:
-    """Its results would be made again in another folder, and its own would be overwritten."""
+    """Otherwise a new recording of the same name would get the folder, and overwrite its run."""
     place, out = "memory://named-recordings", "memory://named-results"
     for day in ("monday", "tuesday"):
         (Location(place) / day / "lab.mcap").write(day.encode())
@@ -1474,7 +1474,7 @@ def test_claim_that_nobody_holds_is_not_taken_from_a_dead_process(
 
 
 def test_recording_that_vanishes_while_it_is_processed_is_named(tmp_path: Path) -> None:
-    """A drive may be unplugged; a digest of nothing would be that of any other recording."""
+    """A drive may be unplugged; all recordings lost in this way would have the same digest."""
     with (
         ContentDigest(tmp_path / "gone.mcap") as content,
         pytest.raises(RecordingError, match=r"gone\.mcap: cannot be read: No such file"),

@@ -41,7 +41,7 @@ def recorded(path: Path, zeros: Collection[int], *, late: bool = False) -> Path:
 def test_zeros_do_not_replace_a_calibration(
     zeros: Collection[int], late: bool, tmp_path: Path
 ) -> None:
-    """Some drivers publish zeros at first; these frames were skipped."""
+    """Some drivers publish zeros at first; frames with them must not be skipped."""
     names = ("zeros", "plain")
     for name, own in zip(names, (zeros, ()), strict=True):
         path = recorded(tmp_path / f"{name}.mcap", own, late=late)

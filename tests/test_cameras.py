@@ -56,7 +56,7 @@ def test_rectified_image_uses_p_and_raw_image_uses_k() -> None:
 def test_image_without_distortion_coefficients_is_rectified(
     model: str, coefficients: tuple[float, ...]
 ) -> None:
-    """ROS's image_geometry reads it so; as that of a fisheye lens the scene would be bent."""
+    """Corrected for a fisheye lens, such an image would be bent; image_geometry agrees."""
     given = calibration(distortion_model=model, d=np.array(coefficients))
 
     assert camera_of_info(given, rectified=False) == (
@@ -105,7 +105,7 @@ def test_image_without_k_uses_p(k: Any) -> None:
 
 
 def test_identity_is_no_calibration() -> None:
-    """Drivers publish it for uncalibrated cameras."""
+    """Drivers publish identity matrices for uncalibrated cameras."""
     matrices = {"k": np.eye(3).ravel(), "p": np.eye(3, 4).ravel()}
 
     with pytest.raises(MessageError, match="CameraInfo without intrinsics"):
@@ -113,7 +113,7 @@ def test_identity_is_no_calibration() -> None:
 
 
 def test_error_shows_the_focal_length_that_is_wrong() -> None:
-    """Engines with y up give a negative one for rows; the error showed that of columns."""
+    """Engines with y up give a negative focal length in y; the error must not show that in x."""
     k = np.diag([500.0, -510.0, 1.0]).ravel()
 
     with pytest.raises(MessageError, match="focal length -510"):
@@ -158,7 +158,7 @@ def test_region_of_interest_applies_before_binning() -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(0, 0), (400, 0), (0, 300)])
 def test_empty_region_of_interest_means_whole_image(width: int, height: int) -> None:
-    """Some drivers fill in only some of its fields."""
+    """Some drivers fill in only some fields of the region."""
     plain, _ = camera_of_info(calibration(), rectified=False)
 
     assert (
@@ -167,7 +167,7 @@ def test_empty_region_of_interest_means_whole_image(width: int, height: int) -> 
 
 
 def fisheye_of_opencv(ray: Any, k: Any) -> Any:
-    """Project slopes by the formula in the documentation of cv::fisheye."""
+    """Distort slopes (x / z, y / z) by the formula in the documentation of cv::fisheye."""
     a, b = ray
     r = np.sqrt(a**2 + b**2)
     theta = np.arctan(r)
@@ -185,7 +185,7 @@ def test_fisheye_matches_published_formula(model: str, ray: tuple[float, float])
 
 
 def rational_of_opencv(ray: Any, d: Any) -> Any:
-    """Project slopes by the formula in the documentation of cv::projectPoints."""
+    """Distort slopes (x / z, y / z) by the formula in the documentation of cv::projectPoints."""
     x, y = ray
     k1, k2, p1, p2, k3, k4, k5, k6 = d
     r2 = x * x + y * y
@@ -230,7 +230,7 @@ WIDE = (4.7247, 3.2092, 0.0, 0.0001, 0.1706, 5.0559, 4.7758, 0.8865)
 
 
 def test_wide_lens_is_inverted_up_to_its_edge() -> None:
-    """It compresses the edge so much that slow convergence passed for a lens without inverse."""
+    """The edge is so compressed that slow convergence would pass for a lens without inverse."""
     camera = Camera(64, 64, 31.5, 31.5, 32.1, 31.8)
     rays = undistorted_rays(camera, "rational_polynomial", WIDE)
     assert rays is not None
@@ -242,7 +242,7 @@ def test_wide_lens_is_inverted_up_to_its_edge() -> None:
 
 
 def test_pixels_outside_the_image_of_a_lens_see_no_ray() -> None:
-    """They used to make the lens count as one that cannot be inverted."""
+    """Pixels that no ray reaches must not make the lens count as one that cannot be inverted."""
     camera, d = Camera(64, 64, 40.0, 40.0, 32.0, 32.0), (-0.3, 0, 0, 0, 0)  # at most a slope of 0.7
     rays = undistorted_rays(camera, "plumb_bob", d)
     assert rays is not None

@@ -223,7 +223,7 @@ def test_only_views_of_same_kind_are_reused() -> None:
 
 
 def test_views_of_both_sensors_count() -> None:
-    """Their frames have equal numbers, but neither repeats the other."""
+    """Frames of two sensors have equal numbers, but neither repeats the other."""
     found = [
         replace(
             FrameDetections(
@@ -243,7 +243,7 @@ def test_views_of_both_sensors_count() -> None:
 
 
 def test_each_topic_has_its_own_poses(tmp_path: Path) -> None:
-    """One of them begins later, and has a pose in half of its frames."""
+    """A topic may begin later and lack some poses, which must not be taken from another topic."""
     order = [("/head", 0), ("/head", 1), ("/hand", 0), ("/head", 2), ("/hand", 1)]
     moved = Pose(np.eye(3), np.array([1.0, 2.0, 3.0]))
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:

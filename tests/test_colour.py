@@ -76,7 +76,7 @@ def test_points_outside_lens_model_are_not_projected() -> None:
 def test_points_are_projected_up_to_turning_point_of_lens(
     model: str, coefficients: tuple[float, ...], slope: float, *, visible: bool
 ) -> None:
-    """A limit on the slope is not a limit on its square."""
+    """If the limit were taken for its square, points near it would be lost, or be misplaced."""
     lens = LensCamera(LENS.pinhole, model, coefficients)
     points = np.array([[slope, 0, 1], [0.6 * slope, -0.8 * slope, 1]])
     projected = project(points, lens, IDENTITY)
@@ -130,9 +130,9 @@ def test_projection_follows_lens_model(model: str, coefficients: tuple[float, ..
 
 @pytest.mark.parametrize("k1", [-0.2, 0.2])
 def test_rectified_image_matches_bilinear_interpolation(k1: float) -> None:
-    """Colours run differently in x and y.
+    """Colours are random, so that swapped axes are noticed.
 
-    A lens that bends outward asks for pixels beyond each border, where there are none.
+    A lens that bends outward needs pixels beyond each border; they are black.
     """
     lens = LensCamera(Camera(24, 18, 20.0, 21.0, 11.3, 8.8), "plumb_bob", (k1, 0, 0.02, 0.01, 0))
     pixels = np.random.default_rng(7).integers(0, 256, (18, 24, 3)).astype(np.uint8)
@@ -219,7 +219,7 @@ def test_surface_far_away_in_depth_image_may_occlude_object() -> None:
     lens = LensCamera(Camera(320, 240, 140.0, 141.0, 80.3, 58.9))
     (mask,) = dense_masks(frame, [board], lens, Pose(np.eye(3), np.array([0.4, 0.0, 0.0])))
 
-    # By 56 / 0.5 pixels, to columns 122 to 151; the board by 56 / 2, to columns 128 to 158.
+    # The post moves by 56 / 0.5 pixels, to columns 122 to 151; the board by 56 / 2, to 128 to 158.
     assert np.abs(np.subtract((mask.left, mask.left + mask.box[2]), (152, 159))).max() <= 4
 
 
@@ -258,7 +258,10 @@ def test_mask_extends_to_image_border(part: tuple[slice, slice]) -> None:
 
 
 def two_boards() -> tuple[Frame, Any, Any]:
-    """Return a near board in front of the left of a far one, before a wall."""
+    """Return a frame of a wall and two boards, and the pixel indices of the near and the far board.
+
+    The near board hides the left end of the far one.
+    """
     depth = np.full((120, 160), 2.0, np.float32)
     depth[30:90, 40:120] = 1.0  # far board
     depth[40:80, 20:60] = 0.6  # near board
@@ -375,7 +378,7 @@ def test_union_of_masks_with_overlapping_boxes_keeps_all_pixels() -> None:
 
 
 def test_box_of_several_detections_encloses_all() -> None:
-    """Sizes are not corners; the boxes drawn on images come from here."""
+    """Boxes are left, top, width and height; taken for corners, they would be drawn wrong."""
     boxes = {0: (30, 4, 5, 6), 2: (7, 21, 9, 8), 3: (0, 0, 99, 99)}
     masks = ImageMasks("/color", 1, 2, "color", 200, 100, boxes, {})
 
@@ -456,7 +459,7 @@ def test_snapped_neighbouring_masks_do_not_overlap() -> None:
 
 
 def test_pixels_between_snapped_masks_go_to_one_of_them() -> None:
-    """A body and its bar of the same colour, with a gap of 4 columns between their masks."""
+    """The masks of a body and a bar of the same colour both grow into the gap between them."""
     pixels, _ = image_of_a_box((170, 90, 60))
     pixels[:36, 50:70] = pixels[44:, 50:70] = pixels[:36, :20].mean(axis=(0, 1))
     body, bar = Mask(30, 20, np.ones((40, 18), bool)), Mask(52, 36, np.ones((8, 18), bool))

@@ -93,7 +93,7 @@ def test_masks_are_where_objects_are_when_colour_image_is_taken(walk: Path) -> N
 
 
 def test_kitti_boxes_are_on_objects_of_colour_image(walk: Path, tmp_path: Path) -> None:
-    """The image in image_2 is that of another time, too; 2D boxes and P2 must fit it."""
+    """The image in image_2 is of another time than the points; the 2D boxes must fit it."""
     export_run(read_finished(walk), "kitti", tmp_path)
     truth = true_labels(walk)
     with (tmp_path / "walk" / "frames.csv").open() as file:
@@ -138,7 +138,7 @@ def matrix(a_from_b: Pose) -> F8:
 
 
 def buffer(*, start: Pose = START, end: Pose = END) -> TransformBuffer:
-    """Return transforms of a robot with two cameras, of which one turns on the other."""
+    """Return transforms of a moving robot with a depth camera, which carries a colour camera."""
     found = TransformBuffer()
     links = [("base", "depth", LINK, LINK), ("map", "base", start, end)]
     for parent, child, *poses in links:
@@ -183,12 +183,12 @@ def still_view(frame_id: str = "colour", stamp: int = LATER) -> ColourView:
 WANTED = (
     COLOUR_FROM_DEPTH @ np.linalg.inv(matrix(END) @ matrix(LINK)) @ matrix(START) @ matrix(LINK)
 )
-"""Pose of the depth sensor, at its time, in the frame of the colour camera at the other time."""
+"""Pose of the depth sensor, at its time, in the colour camera at the time of the colour image."""
 
 
 @pytest.mark.parametrize("frame_id", ["colour", "/colour", "not in the transforms"])
 def test_colour_camera_is_where_it_is_at_the_time_of_its_image(frame_id: str) -> None:
-    """Extrinsics of a driver are no transforms; then both cameras move together."""
+    """A frame that is not in the transforms is taken to move with the depth camera."""
     found = corrected(buffer(), still_view(frame_id))
 
     assert_allclose(matrix(found.colour_from_depth), WANTED, atol=1e-9)
@@ -216,7 +216,7 @@ def test_data_with_other_axes_than_their_frame_move_as_their_frame() -> None:
 
 
 def test_cloud_in_the_map_is_seen_from_where_the_colour_camera_is() -> None:
-    """The frame of such data is at rest, unlike the camera."""
+    """The frame of a cloud in the map is at rest, unlike the camera."""
     sensor = compose(START, LINK)
     found = corrected(buffer(), still_view(), sensor, frame_id="map", frame_from_sensor=sensor)
 

@@ -31,7 +31,7 @@ def write_tables(
 
     Parameters
     ----------
-    poses : ``right``, ``none``, or ``still``, as in a frame of the robot that carries the camera.
+    poses : those in the tables: ``right``, ``none``, or ``still``, as in a frame of the robot.
     carried_m_s : speed of the objects.
     """
     objects = np.array([[0.1, 0.3, 1.9], [0.8, -0.4, 1.2], [1.4, 0.1, 1.5]])
@@ -105,7 +105,7 @@ def test_displaced_masks_are_reported(
 def test_recording_without_transforms_says_that_its_masks_are_displaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The static transforms of a driver give poses, too, but none that tell of a motion."""
+    """The static transforms of a driver give poses, but these do not show that the camera moves."""
     link = [("camera_link", OPTICAL, LINK_FROM_OPTICAL)]
     monkeypatch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
     warnings = {}

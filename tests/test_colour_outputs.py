@@ -50,7 +50,7 @@ UP = np.array([0.0, -1.0, 0.0])
 
 @pytest.fixture
 def run(coloured_run: Path) -> Path:
-    """Return a copy of `coloured_run`."""
+    """Return `coloured_run` itself: tests that change it make a copy."""
     return coloured_run
 
 
@@ -85,7 +85,7 @@ def test_stored_boxes_match_masks(run: Path) -> None:
 
 
 def test_review_has_original_images(run: Path) -> None:
-    """Compressing twice would blur them. Every frame whose scene is drawn has its own image."""
+    """Images compressed twice are blurred. Every frame whose scene is drawn has its own image."""
     entity = "/images//camera/depth/image_raw"
     source = run.parents[1] / "table.mcap"
     images = [bytes(message.data) for _, message in read_ros(source, IMAGES)]
@@ -115,7 +115,7 @@ def test_selected_frames_keep_their_own_image(run: Path, wanted: Sequence[int]) 
 
 
 def test_frames_keep_their_image_if_the_clock_was_set_back(tmp_path: Path) -> None:
-    """Masks lay on an image from before, as its stamp was as near: wrong in exports and review."""
+    """Found by stamp alone, the image of a mask might be from before the clock was set back."""
     logged = [EPOCH + k * 100 * MS for k in range(20)]
     stamps = [time - (k > 9) * SECOND for k, time in enumerate(logged)]
     items: list[tuple[str, int, Any]] = []
@@ -189,7 +189,7 @@ def test_image_annotations_have_stamp_and_frame_of_image(run: Path) -> None:
 def test_colours_of_unorganized_cloud_are_not_annotated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """They are a row of points, which no viewer shows as an image."""
+    """Colours of such a cloud are a single row, which no viewer shows as an image."""
     masks = [
         (("/d", k), ImageMasks("/colour", 7 + k, 7, "camera", 64, height, {}, {}))
         for k, height in enumerate((1, 48))
@@ -305,7 +305,7 @@ def test_run_lengths_match_coco_and_decode_to_mask() -> None:
             assert back.box == mask.box
     with pytest.raises(ValueError, match="run lengths of 5 pixels"):
         rle_mask(np.array([5]), 2, 3)
-    # The example of a 3 x 4 image in the docstring, and COCO's text of larger differences.
+    # Of a 3 x 4 image; from the fourth on, a run is a difference from the run two before it.
     assert rle_text(np.array([3, 2, 1, 1, 5])) == "321O4"
 
 

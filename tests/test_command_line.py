@@ -49,7 +49,7 @@ def runs(shapecat: Run, recording: Path, tmp_path_factory: pytest.TempPathFactor
 
 
 def test_recording_given_twice_is_named(shapecat: Run, recording: Path, tmp_path: Path) -> None:
-    """With one run for two names, the results of the other name seemed to be lost."""
+    """With one run for two names, the results of one name would seem to be lost."""
     link, folder, out = tmp_path / "b.mcap", tmp_path / "in", tmp_path / "out"
     folder.mkdir()
     file = folder / "a.mcap"
@@ -85,7 +85,7 @@ def test_inputs_without_a_recording_are_named(
 
 
 def test_results_do_not_replace_the_recording(shapecat: Run, tmp_path: Path) -> None:
-    """A ROS 2 bag in --out has the name of its run folder: it seemed to be in the way."""
+    """A ROS 2 bag in --out is where its own results would be written."""
     bag, out = record(tmp_path / "in" / "day", 2, container="ros2"), tmp_path / "in"
     before = {path: path.read_bytes() for path in bag.iterdir()}
 
@@ -102,7 +102,7 @@ def test_results_do_not_replace_the_recording(shapecat: Run, tmp_path: Path) -> 
 
 
 def test_batch_beside_a_foreign_manifest_is_refused(shapecat: Run, tmp_path: Path) -> None:
-    """The lines of the batch were appended to it without a word."""
+    """The lines of the batch would be appended to a file of another program."""
     out = tmp_path / "out"
     for file in (tmp_path / "in" / "a.mcap", tmp_path / "in" / "b.mcap", out / "manifest.jsonl"):
         file.parent.mkdir(exist_ok=True)
@@ -217,7 +217,7 @@ def test_verbose_is_off_by_default(
 def test_unwritable_output_is_refused_before_reading_data(
     shapecat: Run, tmp_path: Path, command: tuple[str, ...]
 ) -> None:
-    """Even root cannot write inside a file. The data set does not exist."""
+    """Otherwise hours of training are lost. The data set does not exist; PLACE is a file."""
     (tmp_path / "file").write_text("")
     names = {"DATA": str(tmp_path / "none"), "PLACE": str(tmp_path / "file")}
     words = [names.get(word, word.replace("PLACE", names["PLACE"])) for word in command]
@@ -353,7 +353,7 @@ def test_url_is_refused_where_it_would_be_a_local_path(
 
 @pytest.mark.parametrize("kind", ["ANY_PATH", "PATH_OR_URL"])
 def test_home_folder_is_expanded(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    """Bash leaves it in ``--out=~/results``: Arrow would write elsewhere than the other files."""
+    """Bash leaves the ``~`` in ``--out=~/results``: tables and other files would be separated."""
     monkeypatch.setenv("HOME", "/home/robot")
 
     convert = getattr(import_module("shapecat.cli.options"), kind).convert
@@ -439,7 +439,7 @@ def test_index_of_scattered_runs_links_to_their_pages(shapecat: Run, runs: Path)
 
 @pytest.mark.usefixtures("without_pictures")
 def test_index_of_links_is_beside_the_links(shapecat: Run, runs: Path, tmp_path: Path) -> None:
-    """It was made in a folder that holds all their targets, for example the home folder."""
+    """Beside the targets of the links, the index might be in the home folder."""
     chosen = tmp_path / "chosen"
     chosen.mkdir()
     for name in ("a", "deep/c"):
@@ -455,7 +455,7 @@ def test_index_of_links_is_beside_the_links(shapecat: Run, runs: Path, tmp_path:
 
 @pytest.mark.usefixtures("without_pictures")
 def test_index_of_others_is_kept(shapecat: Run, runs: Path) -> None:
-    """The folder of the runs may be that of a web site; earlier versions made the last page."""
+    """The folder of runs may be a web site; only an index that shapecat made is replaced."""
     index, pages = runs / "a" / "index.html", [*runs.rglob("*.html")]
     for page in pages:
         page.unlink()
@@ -630,7 +630,7 @@ def test_compile_notice_appears_once(capsys: pytest.CaptureFixture[str], kind: s
 def test_workers_that_wait_for_another_command_say_so_once(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One line for all of them, every ten seconds."""
+    """There is one line for all workers, every ten seconds."""
     module = import_module("shapecat.cli.progress")
     now = 50.0
     monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
@@ -722,7 +722,7 @@ command(["export", "a", "b", "c", "--format", "kitti", "--out", "out"])
 
 
 def test_reader_that_leaves_early_does_not_end_an_export() -> None:
-    """With `export ... | head -1`, the other runs were not exported."""
+    """With `export ... | head -1`, only the first run would be exported."""
     reader, pipe = os.pipe()
     os.close(reader)
     done = subprocess.run(
@@ -734,7 +734,7 @@ def test_reader_that_leaves_early_does_not_end_an_export() -> None:
 
 
 def test_closed_stdout_does_not_change_the_exit_code(tmp_path: Path) -> None:
-    """Without it, `process` crashed after the work, and files got its number."""
+    """Without stdout, `process` crashed after the work, and files got its descriptor."""
     words = ["process", str(tmp_path / "missing.mcap"), "--out", str(tmp_path / "out")]
     command = ["sh", "-c", 'exec "$@" >&-', "sh", sys.executable, "-m", "shapecat", *words]
     done = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
@@ -783,7 +783,7 @@ def test_unwritable_stderr_does_not_end_the_work(
     kind: str,
     how: str,
 ) -> None:
-    """A log may fill its disk, and a terminal may be closed; the code is that of the failure."""
+    """A log may fill its disk, or a terminal be closed; recordings must be processed anyway."""
     bad = tmp_path / "bad.mcap"
     bad.write_text("no recording")
     words = ["process", str(recording), str(bad), "--out", str(tmp_path / "out"), "--no-rrd"]
@@ -799,7 +799,7 @@ def test_unwritable_stderr_does_not_end_the_work(
 
 
 def test_stderr_can_be_flushed_when_python_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Python 3.13 flushes it after all names of its module are None, and prints errors of that."""
+    """Python 3.13 flushes stderr after setting the module's names to None, and prints any error."""
     monkeypatch.setattr(sys, "stderr", sys.__stderr__)
     forgive_stderr()
     module = import_module("shapecat.system.standard_streams")
@@ -855,7 +855,7 @@ def test_unwritable_stderr_keeps_exit_code(how: str) -> None:
 def test_scene_of_damaged_table_is_refused(
     shapecat: Run, guessed_run: Path, tmp_path: Path, below: list[int | None]
 ) -> None:
-    """Two objects on each other would be climbed down for ever, an object on nothing crashes."""
+    """Two objects on each other would give an endless loop, an object on nothing a crash."""
     folder = tmp_path / "run"
     shutil.copytree(guessed_run, folder)
     table = pq.read_table(folder / "detections.parquet")
@@ -888,7 +888,7 @@ def test_scene_of_damaged_table_is_refused(
 def test_path_that_is_not_utf8_is_refused_in_one_line(
     shapecat: Run, guessed_run: Path, tmp_path: Path, words: tuple[str, ...]
 ) -> None:
-    """Arrow and Rerun cannot open it, and end with a traceback."""
+    """Arrow and Rerun cannot open such a path, and would end with a traceback."""
     strange = tmp_path / os.fsdecode(b"k\xfcche")
     for parent in (tmp_path, strange):
         shutil.copytree(guessed_run, parent / "run")

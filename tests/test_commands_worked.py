@@ -64,7 +64,7 @@ def test_time_left_follows_remaining_bytes(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_time_left_falls_during_a_recording(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Finished recordings alone would let it grow; compiling must not count."""
+    """By finished recordings alone, the time left would grow; compiling must not count."""
     now = 0.0
     monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
     progress = PROGRESS.Progress([task("a", size=100), task("b", size=300)])
@@ -212,7 +212,7 @@ def test_simulate_replaces_no_file_without_overwrite(
 
 
 def test_simulate_leaves_no_colour_labels_of_another_scene(shapecat: Run, tmp_path: Path) -> None:
-    """They would be mistaken for the truth of the new recording."""
+    """Old colour labels would be mistaken for the truth of the new recording."""
     (tmp_path / "a.color_labels.npz").write_text("old")
     done = shapecat("simulate", tmp_path / "a.mcap", "--overwrite", "--frames", 1)
 
@@ -224,7 +224,7 @@ def test_simulate_leaves_no_colour_labels_of_another_scene(shapecat: Run, tmp_pa
 def test_empty_time_range_is_refused(
     shapecat: Run, tmp_path: Path, end: str, *, refused: bool
 ) -> None:
-    """It would be a run without frames, which looks like an empty scene."""
+    """A run without frames would look like one of an empty scene."""
     missing = tmp_path / "missing.mcap"
     found = shapecat("process", missing, "--out", tmp_path, "--start", "2.5", "--end", end)
 
@@ -246,7 +246,7 @@ def test_recording_option_is_refused_for_several_runs(shapecat: Run, tmp_path: P
 
 
 def test_plan_describes_remaining_work() -> None:
-    """Its megabytes and processes count the remaining recordings."""
+    """Megabytes and processes in the plan are those of the remaining recordings."""
     tasks = [
         task("a", "complete", 9_000_000),
         task("b", "retry", 1_200_000),
@@ -263,7 +263,7 @@ def test_plan_describes_remaining_work() -> None:
 
 
 def test_cores_are_shared_by_remaining_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With one recording left of many, it had one core, and the others were idle."""
+    """The last recording of many would have one core, while the other cores are idle."""
     counted: list[tuple[int | None, int]] = []
 
     def share(jobs: int | None, recordings: int) -> tuple[int, int]:
@@ -388,7 +388,7 @@ def test_at_most_three_warnings_per_new_run_are_printed(capsys: pytest.CaptureFi
 def test_plain_progress_shows_done_running_and_remaining(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At most one line in five seconds; the time left follows from the bytes and frames done."""
+    """There is at most one line in five seconds; the time left is that for the remaining bytes."""
     now = 100.0
     monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
     progress = PROGRESS.PlainProgress([task("a", size=100), task("b", size=300), task("c")])
@@ -564,7 +564,7 @@ class _JobCollector(WorkerExecutor):
 def test_workers_of_a_cluster_get_absolute_paths(
     shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They may have another current folder: they missed recordings, and wrote results there."""
+    """Workers in another current folder would miss the recordings, and write results there."""
     monkeypatch.chdir(tmp_path)
     Path("a.mcap").write_bytes(b"\x89MCAP")
     save_model(Path("m.npz"), load_model())
@@ -584,7 +584,7 @@ ODD = ("/cam[left]/depth", "k [/night].mcap", "box :car:")
 def test_pipe_is_no_terminal_with_forced_colours(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """CI servers set it: names were broken into lines, and bars filled the log."""
+    """CI servers set FORCE_COLOR: names would be broken into lines, and bars fill the log."""
     monkeypatch.setenv("FORCE_COLOR", "1")
     topics = [f"/{'left' * 60}/{name}" for name in ("image_raw", "points")]
     RENDER.print_table(("topic", "type"), [[topic, "std_msgs/msg/" * 3] for topic in topics])

@@ -108,7 +108,10 @@ def write_run(
     step: int = STEP,
     part: slice = slice(0, 3),
 ) -> Path:
-    """Write the tables of a run of ``part`` of three frames by hand; there is no recording."""
+    """Write the tables of a run of three frames, or ``part`` of them; there is no recording.
+
+    Frames are ``step`` ns apart, and the first one is ``shift_ns`` after `START`.
+    """
     folder.mkdir(parents=True)
     stamps = [START + shift_ns + step * k for k in range(3)[part]]
     none: dict[str, Any] = dict.fromkeys(FRAMES.names)
@@ -185,7 +188,7 @@ def coco_text(**changes: dict[str, str]) -> str:
 
 
 def test_coco_crowd_has_undecidable_category() -> None:
-    """Other tools mark ambiguous objects this way: they count as found, without a category."""
+    """Other tools mark ambiguous objects as crowds: they count as found, without a category."""
     square = [[1, 0, 3, 0, 3, 2, 1, 2]]
     annotations = [
         {"id": k, "image_id": 7, "category_id": 4, "segmentation": square, "iscrowd": k}
@@ -207,7 +210,7 @@ def test_coco_crowd_has_undecidable_category() -> None:
 @pytest.mark.parametrize("track", [0, 7])
 @pytest.mark.parametrize("attribute", [False, True])
 def test_coco_tracks_are_read_from_field_or_attribute(track: int, attribute: bool) -> None:
-    """CVAT writes them as an attribute, from 0. If an object has none, none are compared."""
+    """CVAT writes tracks as an attribute, from 0. If an object has none, no tracks are compared."""
     own: dict[str, Any] = {"track_id": track}
     own = {"attributes": {**own, "x": 3}} if attribute else own
     item = {"id": 1, "image_id": 2, "category_id": 4, "segmentation": [[1, 0, 3, 0, 3, 2, 1, 2]]}
@@ -286,7 +289,7 @@ def test_pixels_on_hidden_object_are_not_wrong(run: Path, truth: Path) -> None:
 
 @pytest.mark.parametrize(("beside", "kept"), [(2, [10, 11, 12]), (3, None)])
 def test_detection_is_left_out_if_mostly_ignored(beside: int, kept: list[int] | None) -> None:
-    """One that merely touches an ignored object is compared by its other pixels."""
+    """A detection that merely touches an ignored object is compared by its other pixels."""
     ignored = np.zeros(SIDE * SIDE, bool)
     ignored[13 : 13 + beside] = True
     true = Labelling((), ~ignored, (SIDE, SIDE), ignored)
@@ -347,9 +350,9 @@ def test_identity_switch_is_counted_once() -> None:
 def test_identity_switch_is_not_counted_beside_another_difference(
     other: tuple[int | None, str],
 ) -> None:
-    """A row has one difference: a switch in a row with a wrong category is in the figures alone.
+    """A row has one difference: beside a wrong category, only the figures count the switch.
 
-    A detection without a track is no other track.
+    A detection without a track is not another track.
     """
     tally, cup = Tally(), LabelledItem(11, "cup")
     track, category = other
@@ -363,7 +366,7 @@ def test_identity_switch_is_not_counted_beside_another_difference(
 
 
 def test_page_has_each_metric_in_its_place(run: Path, truth: Path) -> None:
-    """The metrics are those above; the table has the tracks of the run, not of the truth."""
+    """Metrics are calculated by hand above; tracks are those of the run, not of the truth."""
     found = compare(run, truth)
     values = {name.strip(): (value, meaning) for name, value, meaning in figure_rows(found)}
     rows = re.findall(r"<tr>(.*?)</tr>", format_page(found))
@@ -385,7 +388,10 @@ def test_page_has_each_metric_in_its_place(run: Path, truth: Path) -> None:
 
 @pytest.mark.parametrize(("category", "text"), [("can", "0.99"), ("unknown", "")])
 def test_page_words_confidences_like_the_report(category: str, text: str) -> None:
-    """1.00 would pass for certain, and that of an unknown object is of its likeliest category."""
+    """A confidence of 1.00 would pass for certainty.
+
+    That of an unknown object is the confidence of its likeliest category, and is left out.
+    """
     row = Difference("/d", 7, START, "surplus", track=22, category=category, confidence=0.9961)
     page = format_page(replace(worked(), rows=(row,)))
     cells = re.findall(r"<td>(.*?)</td>", page.rpartition("<table>")[2])
@@ -589,7 +595,7 @@ def test_frame_of_image_is_read_from_its_name(name: str, key: tuple[str, int]) -
     ],
 )
 def test_coco_images_of_the_same_frame_are_refused(places: list[dict[str, Any]]) -> None:
-    """Otherwise, the labels of one of them would count for both."""
+    """Otherwise, the labels of one image would count for both."""
     images = [{"id": k, "width": 4, "height": 3, **place} for k, place in enumerate(places)]
     content = {"categories": [], "annotations": [], "images": images}
 
@@ -598,7 +604,7 @@ def test_coco_images_of_the_same_frame_are_refused(places: list[dict[str, Any]])
 
 
 def test_coco_rectangles_are_refused() -> None:
-    """Tools write them with an empty list of polygons, and each object seemed to be missed."""
+    """Tools write rectangles with an empty list of polygons: each object would seem missed."""
     item = {"id": 7, "image_id": 0, "category_id": 1, "bbox": [1, 1, 2, 1], "segmentation": []}
     content = {
         "categories": [{"id": 1, "name": "cup"}],
@@ -611,7 +617,7 @@ def test_coco_rectangles_are_refused() -> None:
 
 
 def test_kitti_label_files_of_the_same_frame_are_refused(tmp_path: Path) -> None:
-    """Otherwise, the labels of one of them would count for both."""
+    """Otherwise, the labels of one file would count for both."""
     (tmp_path / "label_2").mkdir()
     for name in ("4", "000004"):
         (tmp_path / "label_2" / f"{name}.txt").touch()
@@ -780,7 +786,7 @@ def test_overlap_fractions_use_their_own_counts() -> None:
 def test_each_part_of_the_run_has_one_picture(
     run: Path, truth: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of two parts of three frames, the first has two, of which the first one differs more."""
+    """Three frames in two parts: the first part has frames 0 and 1, of which 0 differs more."""
     monkeypatch.setattr(comparing, "_PICTURES", 2)
 
     assert [picture.frame for picture in compare(run, truth).pictures] == [0, 2]
@@ -845,7 +851,7 @@ def test_near_surfaces_that_face_the_camera_are_bright() -> None:
     assert np.unique(shades[:, 21:37]).tolist() == [23]
     assert np.unique(shades[:, 38:]).tolist() == [2]
     assert np.unique(lit[0]).tolist() == [47]
-    # 26 mm per pixel at 1 m: 0.35 + 0.65 / sqrt(1 + (250 * 0.0256) ** 2) of it
+    # 26 mm per pixel at 1 m: 0.35 + 0.65 / sqrt(1 + (250 * 0.0256) ** 2) of the brightest
     assert lit[5, 0] == pytest.approx(47 * 0.45, abs=1)
     assert _shades(None, 2, 3).tolist() == [36] * 6
 
@@ -908,7 +914,7 @@ def test_labels_of_frame_match_its_topic_and_stamp() -> None:
 
 
 def test_unmatched_frames_are_reported_by_side(shapecat: Run, run: Path, truth: Path) -> None:
-    """Swapped, they would make the user search for the gap in the wrong run."""
+    """Swapped counts would make the user search for the gap in the wrong run."""
     entries = json.loads(truth.read_text())
     later = [{**entries[0], "stamp_ns": START + STEP * k} for k in (5, 6, 7, 8)]
     truth.write_text(json.dumps([*entries[:2], *later]))
@@ -946,7 +952,7 @@ def test_existing_output_folder_is_not_replaced(shapecat: Run, run: Path, truth:
 
 
 @pytest.mark.skipif(not SCORER.exists(), reason="the other scorer is not on this machine")
-@pytest.mark.filterwarnings("ignore::ResourceWarning")  # it leaves closing files to Python
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # the scorer does not close its files
 def test_metrics_match_another_scorer(
     run: Path, truth: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -997,7 +1003,7 @@ def test_runs_with_different_start_are_compared_by_stamp(run: Path) -> None:
 def test_frame_numbers_of_a_run_with_start_give_a_note(
     run: Path, start_s: float | None, name: str, *, warned: bool
 ) -> None:
-    """Numbers of the whole recording would silently be those of other images."""
+    """Frame numbers of the whole recording would silently mean other images of the run."""
     about = json.loads((run / "run.json").read_text())
     about["options"]["start_s"] = start_s
     (run / "run.json").write_text(json.dumps(about))
@@ -1031,7 +1037,7 @@ def test_merged_tracks_have_one_identity(run: Path, truth: Path) -> None:
 
 
 def test_merged_tracks_in_one_frame_are_one_object(run: Path) -> None:
-    """All outputs join them. Two objects of one identity would be errors of any tracker."""
+    """All outputs join such tracks; two objects of one identity would count as tracking errors."""
     text = (run / "tracks.csv").read_text()
     (run / "tracks.csv").write_text(text.replace("3,box,0.9,", "3,box,0.9,merge with 2"))
     figures = compare(run, run).figures
@@ -1063,7 +1069,7 @@ def test_detection_without_track_keeps_its_place(run: Path) -> None:
 def test_detection_without_track_is_compared_by_its_full_box(
     shapecat: Run, run: Path, truth: Path
 ) -> None:
-    """It was compared by the box of its visible part, which is smaller than the true one."""
+    """The box of the visible part is smaller than the true one, which is a full box."""
     path = run / "tracks.parquet"
     pq.write_table(pq.read_table(path).slice(1), path)  # of the first frame's cup
     path = run / "detections.parquet"
@@ -1081,7 +1087,7 @@ def test_detection_without_track_is_compared_by_its_full_box(
 
 
 def test_track_of_missing_detection_is_refused(run: Path) -> None:
-    """Its object would count as missed."""
+    """The object of the track would count as missed."""
     path = run / "detections.parquet"
     pq.write_table(pq.read_table(path).slice(1), path)
 
@@ -1123,7 +1129,7 @@ def test_coco_masks_are_read_in_all_forms(shapecat: Run, run: Path) -> None:
 
 
 def test_categories_that_the_model_lacks_are_named(run: Path) -> None:
-    """Labels of another tool, say Cup for cup, left the table without metrics of categories."""
+    """Labels of another tool, say Cup for cup, would silently be missing from the metrics."""
     content = {
         "categories": [{"id": 4, "name": "Cup"}, {"id": 5, "name": "cup"}],
         "images": [
@@ -1252,7 +1258,7 @@ def test_kitti_type_of_two_categories_stands_for_the_first(tmp_path: Path) -> No
 
 
 def test_labels_without_masks_may_end_with_an_empty_frame(run: Path) -> None:
-    """Its detections have masks, but an overlap of this frame alone would be 0."""
+    """Labels without masks give no overlap; that of the empty frame alone would be 0."""
     labels = run.parent / "kitti"
     (labels / "label_2").mkdir(parents=True)
     (labels / "label_2" / "000000.txt").write_text("cup 0 0 0 0 0 0 0 0.2 0.3 0.1 0 0.1 1 0\n")
@@ -1372,7 +1378,7 @@ def test_images_of_other_recordings_are_left_out(run: Path) -> None:
 
 
 def test_recordings_of_runs_with_equal_names_are_told_apart(run: Path) -> None:
-    """Two batches may each have a run ``lab``; frames of the other one are no frames of this."""
+    """Two batches may each have a run ``lab``, whose frames must not be compared with each other."""
     head = {"recording": "lab", "topic": "/d", "frame": 0, "width": 10, "height": 10}
     content = {
         "categories": [],
@@ -1569,7 +1575,7 @@ def test_labels_of_other_frames_are_described_by_their_range(tmp_path: Path) -> 
 def test_damaged_kitti_labels_are_refused_with_the_file(
     tmp_path: Path, file: str, content: str, reason: str
 ) -> None:
-    """They are often edited by hand or by scripts."""
+    """KITTI labels are often edited by hand or by scripts."""
     for folder in ("label_2", "calib"):
         (tmp_path / folder).mkdir()
     (tmp_path / "label_2" / "000007.txt").write_text("cup 0 0 0 0 0 0 0 0.2 0.3 0.1 0 0.1 1 0\n")
@@ -1597,7 +1603,7 @@ def test_label_images_that_end_early_or_are_no_images_are_refused(tmp_path: Path
 
 
 def test_run_with_frames_in_another_order_is_refused(run: Path) -> None:
-    """Its later frames would count as frames without objects."""
+    """Later frames of the run would count as frames without objects."""
     other = open_reference(run)
     stamps = read_stamps(run)
     frames = sorted((key, stamp) for key, stamp in stamps)

@@ -107,7 +107,7 @@ def test_rotated_box_keeps_its_size_and_yaw() -> None:
 
 
 def test_noise_of_flat_side_does_not_shift_box_to_sensor() -> None:
-    """The extremes of many noisy points lie before the side; the far edge has few points."""
+    """The extremes of many noisy points lie in front of the side; the far edge has few points."""
     size = np.array([0.16, 0.1, 0.2])
     points, normals = cuboid(size, np.pi / 2 - 0.24)
     rays = (points + PLACE) / np.linalg.norm(points + PLACE, axis=1)[:, None]
@@ -115,7 +115,7 @@ def test_noise_of_flat_side_does_not_shift_box_to_sensor() -> None:
     box = estimate(noisy, normals, "box")
 
     axes, center = LEVEL @ rotation_from_quaternion(box.orientation), LEVEL @ box.center - PLACE
-    front = normals[0]  # of the side 8 cm before the centre
+    front = normals[0]  # of the side that is 8 cm in front of the centre
     assert center @ front + abs(front @ axes) @ box.size / 2 == pytest.approx(0.08, abs=0.0035)
 
 
@@ -130,7 +130,7 @@ def test_partly_hidden_ball_stays_round() -> None:
 
 
 def test_full_box_reaches_down_to_hidden_support() -> None:
-    """Its height then has a larger deviation."""
+    """The height of an object whose lower part is hidden has a larger standard deviation."""
     points, normals = cylinder(0.04, 0.2)
     top = points[:, 2] > 0.12
     box, hidden = (
@@ -210,7 +210,7 @@ def rectangular(size: np.ndarray) -> np.ndarray:
 
 
 def views_of(centers: np.ndarray, axes: np.ndarray, sizes: np.ndarray) -> BoxViews:
-    """Return views from all sides of boxes with visible outlines."""
+    """Return views of n boxes, given by centres, axes and sizes, from sensors all around."""
     outlines = np.stack([rectangular(size) for size in sizes])
     around = np.linspace(0, 2 * np.pi, len(centers), endpoint=False)
     sensors = centers + np.stack([np.cos(around), np.sin(around), np.ones(len(centers))], axis=1)
@@ -218,7 +218,7 @@ def views_of(centers: np.ndarray, axes: np.ndarray, sizes: np.ndarray) -> BoxVie
 
 
 class InViews(NamedTuple):
-    """The box of an object in some views: its places and axes there, and its size."""
+    """The box of an object: centres (n, 3) and axes (n, 3, 3) in n views, one size and std (3,)."""
 
     centers: np.ndarray
     axes: np.ndarray
@@ -263,7 +263,7 @@ def test_partial_views_do_not_shrink_fused_box() -> None:
 
 
 def test_thin_object_that_moved_has_no_negative_size() -> None:
-    """One side is seen before it moves, the other afterwards: between them is less than nothing."""
+    """A side seen after the object has moved may be beyond the opposite side seen before."""
     sizes = np.tile([0.02, 0.2, 0.3], (6, 1))
     centers = np.array([[0.02, 0, 0]] * 3 + [[-0.02, 0, 0]] * 3)
     views = views_of(centers, np.tile(np.eye(3), (6, 1, 1)), sizes)
@@ -275,7 +275,7 @@ def test_thin_object_that_moved_has_no_negative_size() -> None:
 
 
 def test_view_of_moved_object_keeps_its_pose() -> None:
-    """Its size is that of the other views, and does not become more certain by this view."""
+    """The size is that of the other views, and this view does not make it more certain."""
     centers, sizes = np.zeros((7, 3)), np.tile([0.2, 0.1, 0.3], (7, 1))
     centers[5:], axes = [0.4, 0.1, 0], np.tile(np.eye(3), (7, 1, 1))
     sizes[6], axes[6] = [0.1, 0.2, 0.3], about_z(0.5)
@@ -356,7 +356,7 @@ def test_box_of_carried_object_is_that_of_its_longest_rest() -> None:
 
 
 def test_partial_views_do_not_decide_where_an_object_rests() -> None:
-    """Behind an occluder it is seen longer, but the outlines show only a part of it."""
+    """The object is seen longer behind an occluder, but the outlines show only a part of it."""
     there, on_the_way = np.array([0.8, 0.5, 0]), np.linspace(0.1, 0.9, 8)[:, None]
     centers = np.concatenate([np.zeros((6, 3)), on_the_way * there, np.tile(there, (10, 1))])
     sizes, weights = np.tile([0.2, 0.1, 0.3], (24, 1)), np.ones(24)
@@ -407,7 +407,7 @@ def test_fused_views_give_true_size_of_oval_bottle() -> None:
 
 
 def test_full_box_includes_handle_of_cup() -> None:
-    """An oval around the body alone would cut it off."""
+    """An oval around the body alone would cut off the handle."""
     points, normals = cylinder(0.04, 0.1)
     wall = normals[:, 2] == 0
     tips = np.stack([np.full(60, -0.068), RNG.normal(0, 0.003, 60), RNG.uniform(0.03, 0.07, 60)], 1)

@@ -86,10 +86,10 @@ def test_numbers_of_numpy_are_settings() -> None:
         ("surface.neurons=513", "surface.neurons must be from 20 to 512, got 513"),
         ("surface.voxel_m=0", "surface.voxel_m must be from 0.0001 to 0.02, got 0.0"),
         ("surface.voxel_m=0.5", "to 0.02, got 0.5"),  # all objects would be unknown
-        ("surface.neurons=3", "from 20 to 512, got 3"),  # the same
+        ("surface.neurons=3", "from 20 to 512, got 3"),  # all objects would be unknown
         ("detection.max_height_m=0.02", "from 0.025 to 10.0, got 0.02"),  # no object would be found
         ("tracking.gate_m=120", "from 0.001 to 10.0, got 120"),  # millimetres
-        ("surface.signals=6", "must be at least 100, got 6"),  # the same
+        ("surface.signals=6", "must be at least 100, got 6"),  # all objects would be unknown
         ("surface.smooth_radius_m=1.0", "to 0.1, got 1.0"),
         ("surface.smooth_radius_m=1e-9", "if not 0, must be from 0.0001"),
         ("tracking.gate_m", "expected name=value"),
@@ -101,7 +101,7 @@ def test_error_names_invalid_setting(override: str, message: str) -> None:
 
 
 def test_smoothing_within_voxels_is_refused() -> None:
-    """Hardly any voxel has neighbours that near: all points were dropped, all objects unknown."""
+    """Hardly any voxel has neighbours that near: all points are dropped, all objects unknown."""
     with pytest.raises(ConfigError, match=r"at least 1\.5 times surface\.voxel_m, got 0\.003"):
         with_overrides(Settings(), ["surface.smooth_radius_m=0.003"])
 
@@ -135,7 +135,7 @@ def test_last_of_several_values_of_setting_counts() -> None:
 
 
 def test_file_may_begin_with_byte_order_mark(tmp_path: Path) -> None:
-    """Editors on Windows write one."""
+    """Editors on Windows write a byte order mark."""
     path = tmp_path / "s.toml"
     path.write_bytes(b"\xef\xbb\xbfseed = 3\r\n")
 
@@ -184,7 +184,7 @@ def test_limits_of_schema_are_accepted() -> None:
 
 
 def test_as_dict_has_every_field() -> None:
-    """The stored tree must be enough to repeat a run."""
+    """The stored settings must be enough to repeat a run."""
     settings = changed(Settings())
 
     assert with_settings(Settings(), settings.as_dict()) == settings
@@ -208,7 +208,7 @@ def changed(settings: Any) -> Any:
 
 
 def accepts(settings: Any, name: str, value: float) -> bool:
-    """Return whether a setting may have another value, alone."""
+    """Return whether one setting may be changed to another value without changing others."""
     with suppress(ConfigError):
         return bool(dataclasses.replace(settings, **{name: value}) != settings)
     return False

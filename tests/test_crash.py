@@ -49,7 +49,7 @@ def assert_same_tables(a: Path, b: Path) -> None:
 
 
 def counts(folder: Path) -> dict[str, Any]:
-    """Return a run's counts, excluding those that an interrupted run contributed."""
+    """Return a run's counts without that of resumed frames."""
     return {name: n for name, n in read_run(folder)["counts"].items() if name != "resumed"}
 
 
@@ -91,7 +91,7 @@ def kill_after(arguments: list[str], begun: Path, seconds: float) -> bool:
 
 
 def survive_kills(recording: Path, out: Path, undisturbed: Path, moments: list[float]) -> int:
-    """Kill runs at some moments, check the folder after each kill, then finish."""
+    """Kill runs at some moments, check the folder after each, then finish; return the kills."""
     killed = 0
     for moment in moments:
         killed += kill_after(command(recording, out), out / ".table.partial", moment)
@@ -235,7 +235,7 @@ def test_outputs_show_new_labels_after_an_interrupted_annotation(
 
 
 def test_two_commands_cannot_write_same_outputs(recording: Path, tmp_path: Path) -> None:
-    """They share hidden names: one would remove the file of the other, or undo its labels."""
+    """Two commands share hidden names: one would remove the other's file, or undo its labels."""
     job = Job(recording, tmp_path / "table", frame_range=FrameRange(end_s=0.3), rrd=False)
     process(job)
     (job.folder / "annotated.mcap").unlink()
@@ -267,7 +267,7 @@ def test_two_runs_cannot_write_same_folder(recording: Path, tmp_path: Path) -> N
 def test_recording_still_being_written_gives_no_results(
     recording: Path, tmp_path: Path, when: str
 ) -> None:
-    """Its tables would describe an earlier state of the recording than its outputs."""
+    """The tables would describe an earlier state of the recording than the outputs of the run."""
     source, out = tmp_path / "live.mcap", tmp_path / "out"
     shutil.copy(recording, source)
 

@@ -37,7 +37,7 @@ TICK = SECOND // 30
 
 
 def render_depth(pose: Pose, box: Any = BOX) -> F4:
-    """Return the true depth (h w,) of a box on a floor, by the geometry of rays and slabs."""
+    """Return the true depth (h, w) of a box on a floor; ``box`` is its limits (3, 2), or None."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = np.stack(
         [(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1
@@ -85,7 +85,7 @@ def moved(pose: Pose, other: Pose) -> Pose:
 
 
 def home(*shift: float, gaze: tuple[float, ...] = (0.0, 0.0, 0.0), roll: float = 0.0) -> Pose:
-    """Return a camera pose, displaced from the usual one by some metres."""
+    """Return the pose of a camera that looks at ``gaze`` from `EYE`, displaced by ``shift`` (m)."""
     return looking_at(np.add(EYE, shift), np.array(gaze), roll=roll)
 
 
@@ -138,7 +138,7 @@ def test_fusion_compensates_for_camera_motion(
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("slide", [0.004, -0.004])
 def test_sliding_camera_is_not_taken_for_still(axis: int, slide: float) -> None:
-    """On a linear axis it does not turn; in one direction, surfaces would be biased and smeared."""
+    """On a linear axis, a camera does not turn: taken for still, it would smear surfaces."""
     other = home(0.0, 0.0, 0.0, roll=0.6)  # no surface is parallel to an axis of the camera
     pose = Pose(other.rotation, other.translation + slide * other.rotation[:, axis])
     now, before = render_depth(pose), render_depth(other)
@@ -182,7 +182,7 @@ def shifted_box(x: float) -> Any:
 
 @pytest.mark.parametrize("box", [shifted_box(0.03), shifted_box(-0.06), shifted_box(0.2), None])
 def test_moved_or_new_object_does_not_smear(box: Any) -> None:
-    """Neither at its new nor at its old position."""
+    """No pixel may mix two surfaces, neither at the object's new nor at its old position."""
     now, before = render_depth(HOME), render_depth(HOME, box)
 
     for depth, others in ((now, before), (before, now)):
@@ -279,7 +279,7 @@ def test_topics_are_separate_and_lost_pose_drops_frames() -> None:
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_only_topics_with_a_problem_give_a_warning(count: int) -> None:
-    """Beside them, other sensors are fused as they should; without fusion, none is."""
+    """Other sensors are fused as usual and not named; without fusion, there is no warning."""
     recent, points = RecentFrames(count), np.ones((5, 3), np.float32)
     for k, pose in enumerate((IDENTITY, None, None)):
         depth = frame(render_depth(HOME), k * TICK)
@@ -312,7 +312,7 @@ def with_missing_depth(count: int) -> Iterator[Frame]:
 
 
 def test_indices_refer_to_depth_of_the_frame_itself() -> None:
-    """Exports look them up in the recording, where a filled hole is still a hole."""
+    """Exports look up indices in the recording, where a filled hole is still a hole."""
     *others, now = with_missing_depth(3)
     earlier = tuple(Earlier(other, IDENTITY) for other in others)
     guesser: Any = Guesser()
@@ -329,7 +329,7 @@ def test_indices_refer_to_depth_of_the_frame_itself() -> None:
 
 @pytest.fixture
 def job(tmp_path: Path) -> Job:
-    """Return a job that fuses three frames; another setting must reach the other processes."""
+    """Return a job that fuses three frames, with a setting that must reach other processes."""
     settings = with_overrides(Settings(), ["detection.fuse_frames=3", "surface.neurons=30"])
     source = record(tmp_path / "table.mcap", 40)
     return Job(source, tmp_path / "one", settings=settings, mcap=False, rrd=False)

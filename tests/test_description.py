@@ -241,7 +241,7 @@ def test_features_of_random_points_are_finite(
 
 
 def test_points_far_from_graph_are_ignored() -> None:
-    """A dropped part of the object must not increase its extents."""
+    """A part of the object that its graph leaves out must not increase its extents."""
     view = can()
     crumbs = view.points[:20] + np.array([1, 0, 0], np.float32)
     found = describe(np.concatenate([view.points, crumbs]), view.gas, EYE)

@@ -192,7 +192,10 @@ def test_vertical_axis_is_nearest_to_the_lines_of_the_normals() -> None:
 
 
 def slices(along: F8, across: F8, *, to_narrow: bool) -> tuple[F8, float, float]:
-    """Return width and offset (20,) of ten slices, the relative length, and the filled fraction."""
+    """Return width and offset (20,) of ten slices, the relative length, and the filled fraction.
+
+    With ``to_narrow``, the slices end at the narrow end.
+    """
     low, high = inner_range(along.astype(np.float32))
     number = np.clip((along - low) / (high - low) * OUTLINE_SLICES, 0, OUTLINE_SLICES - 1)
     parts = [across[number.astype(int) == k] for k in range(OUTLINE_SLICES)]
@@ -208,7 +211,7 @@ def slices(along: F8, across: F8, *, to_narrow: bool) -> tuple[F8, float, float]
 
 @pytest.mark.parametrize("seed", range(3))
 def test_outline_has_its_features(seed: int) -> None:
-    """It is the image of a camera that looks at the middle of the object, up in the image."""
+    """The outline is seen by a camera that looks at the middle of the object, upright."""
     surface = random_surface(np.random.default_rng(seed))
     out = np.zeros(len(OUTLINE_NAMES), np.float32)
     outline(surface.points, surface.eye, out)

@@ -41,7 +41,7 @@ def half_cone(rng: np.random.Generator, *, slope: float) -> tuple[F8, F8]:
 def test_principal_axes_solve_eigenvalue_problem(
     values: tuple[float, ...], seed: int, exponent: int, turned: bool
 ) -> None:
-    """A sphere, a cylinder and a plate have equal or no eigenvalues."""
+    """Spheres, cylinders and plates have equal eigenvalues, or eigenvalues of zero."""
     scale = 10.0**exponent
     q = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0] if turned else np.eye(3)
     A = (q * np.array(values)) @ q.T * scale
@@ -98,7 +98,7 @@ def solid_features(cloud: F4, normals: F4) -> F4:
 
 @pytest.mark.parametrize("yaw", [-0.6, -0.3, 0.0])
 def test_box_fits_a_box_and_can_does_not(yaw: float) -> None:
-    """These two were confused most often; corners must distinguish them despite noise."""
+    """Boxes and cans are confused most often; corners must distinguish them despite noise."""
     rng = np.random.default_rng(0)
     cloud, normals = visible_box(rng, yaw)
     box = solid_features(cloud + rng.normal(0, 0.01, cloud.shape).astype(np.float32), normals)

@@ -100,7 +100,7 @@ def shell(center: tuple[float, float, float], radius: float, rim: float | None) 
 
 
 def can(x: float, y: float, z: float, radius: float, height: float) -> Shape:
-    """Return an upright closed cylinder on height ``z``."""
+    """Return an upright closed cylinder that stands at height ``z``."""
 
     def hit(origin: Array, rays: Array) -> Array:
         o = origin - np.array([x, y, z])
@@ -132,7 +132,7 @@ def render(
     noise: float = 0.0015,
     seed: int = 0,
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Return depth (h, w) of a camera looking at the origin, and the shape at each pixel."""
+    """Return depth (h, w) of a camera looking at the origin, and the shape or -1 at each pixel."""
     forward, rays = looking(tilt_deg, camera)
     z, labels = np.full(rays.shape[:-1], np.inf), np.full(rays.shape[:-1], -1)
     for k, shape in enumerate(shapes):
@@ -179,7 +179,10 @@ def overlaps(scene: Scene, labels: I4, objects: list[int]) -> list[float]:
 
 
 def check(shapes: list[Shape], objects: list[int], least: float = 0.85, **view: float) -> Scene:
-    """Check that every listed shape is one candidate, and that there are no others."""
+    """Check that the candidates are the shapes ``objects``; return the scene.
+
+    Each IoU must be above ``least``. ``view`` are options of `render`.
+    """
     depth, labels = render(shapes, **view)  # type: ignore[arg-type]  # floats only
     scene = found(frame_of(depth))
     assert len(scene.candidates) == len(objects)
@@ -269,7 +272,10 @@ def test_stacked_box_is_supported_by_lower_box() -> None:
 
 @pytest.mark.parametrize("high", [0.08, 0.11, 0.2])
 def test_box_behind_another_does_not_stand_on_it(high: float) -> None:
-    """A low one would have no height; of a tall one, the visible part begins at the nearer top."""
+    """The visible part of a tall box begins at the nearer top.
+
+    A low box would have no height above it.
+    """
     shapes = [table(), box((0, 0, 0), (0.22, 0.08, 0.11)), box((0, 0.12, 0), (0.12, 0.08, high))]
     scene = check(shapes, [1, 2])
     assert [candidate.on_candidate for candidate in scene.candidates] == [None, None]
@@ -335,7 +341,7 @@ def test_cup_off_the_axis_is_one_object_from_above() -> None:
 
 
 def test_tall_boxes_beside_each_other_stay_apart_from_above() -> None:
-    """To the left and right, the flank of one is in line with the top of the next."""
+    """To the left and right, the flank of one box is in line with the top of the next."""
     places = [(x, y) for y in (-0.15, -0.05, 0.05, 0.15) for x in (-0.22, -0.11, 0.0, 0.11, 0.22)]
     shapes = [box((x, y, 0), (0.05, 0.04, 0.12)) for x, y in places]
     check([table(1, 1), *shapes], list(range(1, 21)), tilt_deg=89)
@@ -343,7 +349,7 @@ def test_tall_boxes_beside_each_other_stay_apart_from_above() -> None:
 
 @pytest.mark.parametrize(("tilt_deg", "x", "y"), [(50, -0.12, 0.15), (60, 0.05, 0.15)])
 def test_plate_behind_pot_is_not_merged_with_its_floor(tilt_deg: float, x: float, y: float) -> None:
-    """Both may have the same height; the wall of the pot hides the gap between them."""
+    """The plate may be as high as the floor of the pot, and the wall hides the gap between them."""
     shapes = [table(1, 1), pot(0, -0.1, 0.12, 0.08, 0.015), can(x, y, 0, 0.09, 0.012)]
     check(shapes, [1, 2], tilt_deg=tilt_deg)
 
@@ -410,7 +416,7 @@ def test_box_behind_pot_is_not_merged_with_it(tilt_deg: float) -> None:
 
 
 def test_two_boxes_behind_an_occluder_are_not_merged() -> None:
-    """Neither continues the other."""
+    """Neither box continues the other."""
     check([table(), box((-0.12, 0.08, 0), (0.14, 0.06, 0.12), 0.6),
            box((0.12, 0.1, 0), (0.14, 0.06, 0.1), -0.6),
            box((0, -0.1, 0), (0.08, 0.04, 0.2))], [1, 2, 3])  # fmt: skip
@@ -591,7 +597,7 @@ def test_any_image_gives_a_scene(h: int, w: int, seed: int, odd: float) -> None:
 
 
 def test_rounded_points_stay_within_occupancy_grid() -> None:
-    """Beyond their bounds, compiled code would write outside the array."""
+    """For a point rounded to beyond the grid, compiled code would write outside the array."""
     place = np.array([[0.3, 0.3], [0.3 + 2e-6, 0.3 - 1e-6]], np.float32)
 
     assert _count_occupied.py_func(place, 0.3, 0.3, 1024 / 1e-6 * 0.999, 1024) == 2
@@ -647,9 +653,9 @@ def test_hierarchy_of_bare_table_has_only_its_plane() -> None:
 
 @pytest.mark.parametrize("turn", [1, -1])
 def test_hierarchy_puts_each_board_on_the_one_below(turn: int) -> None:
-    """In a tree of a shelf, all boards would seem to stand on the lowest one.
+    """Otherwise all boards of a shelf would seem to stand on the lowest one.
 
-    The up direction is tilted; the corners of the boards go round either way.
+    The up direction is tilted; corners are in clockwise or counterclockwise order.
     """
     axes = np.array([[0.6, 0.64, 0.48], [0.8, -0.48, -0.36], [0, 0.6, -0.8]])  # right, away, up
 
@@ -764,7 +770,7 @@ def world_points(shapes: list[Shape], turn_deg: float, seed: int) -> Array:
 
 
 def test_objects_are_detected_in_fused_cloud_of_two_sides() -> None:
-    """Its origin is no viewpoint, and no viewpoint sees all of its points."""
+    """The origin of such a cloud is no viewpoint, and no viewpoint sees all of its points."""
     shapes = [table(), box((-0.12, 0, 0), (0.1, 0.1, 0.12)), can(0.12, 0.05, 0, 0.04, 0.14)]
     points = np.concatenate([world_points(shapes, 0, 0), world_points(shapes, 180, 1)])
     scene = found(Frame("cloud", 0, 0, 0, "table", points=points))
@@ -780,7 +786,7 @@ def test_objects_are_detected_in_fused_cloud_of_two_sides() -> None:
 
 
 def test_hidden_wall_in_fused_cloud_is_no_object() -> None:
-    """The largest sizes apply to what the virtual camera does not see, as to what it sees."""
+    """The limits of size also apply to what the virtual camera does not see."""
     shapes = [table(), box((-0.12, 0, 0), (0.1, 0.1, 0.12)), box((0, 0.3, 0), (0.9, 0.03, 0.25))]
     points = np.concatenate([world_points(shapes, 0, 0), world_points(shapes, 180, 1)])
     scene = found(Frame("cloud", 0, 0, 0, "table", points=points))
@@ -789,7 +795,7 @@ def test_hidden_wall_in_fused_cloud_is_no_object() -> None:
 
 @pytest.mark.parametrize("share", [0.9, 1.05])
 def test_cloud_beyond_the_range_has_no_objects(share: float) -> None:
-    """As in a depth image, whether few points are within the range or none."""
+    """It makes no difference whether a few points are within the range, or none."""
     points = frame_of(render(SCENE)[0]).xyz()
     near = np.nanquantile(np.linalg.norm(points, axis=1), 0.02)
     settings = DetectionSettings(max_range_m=float(share * near))
@@ -799,7 +805,7 @@ def test_cloud_beyond_the_range_has_no_objects(share: float) -> None:
 
 @pytest.mark.parametrize("distance", [0.28, 0.34, 0.42])
 def test_objects_close_to_the_camera_stay_whole(distance: float) -> None:
-    """A camera at the wrist of a robot: on slanted faces, inverse depth changes fast."""
+    """For a camera at the wrist of a robot, inverse depth changes fast on slanted faces."""
     shapes = [table(), box((-0.06, 0, 0), (0.06, 0.05, 0.05), yaw=0.6), ball((0.06, 0, 0.03), 0.03)]
     check(shapes, [1, 2], distance=distance, tilt_deg=50)
 
@@ -813,7 +819,7 @@ def test_objects_are_detected_from_directly_above() -> None:
 @pytest.mark.parametrize("yaw", [0.3, 0.8, 1.3])
 @pytest.mark.parametrize("tilt_deg", [30, 60, 80])
 def test_top_of_distant_carton_is_no_table(tilt_deg: float, yaw: float) -> None:
-    """At 1.6 m, the side of a box is hardly behind its top where it begins."""
+    """At 1.6 m, the side of a box is hardly farther away than the edge of its top."""
     check([table(0.7, 0.5), box((0, 0, 0), (0.3, 0.2, 0.15), yaw=yaw)], [1],
           tilt_deg=tilt_deg, distance=1.6)  # fmt: skip
 
@@ -868,7 +874,7 @@ def test_tilted_top_face_does_not_replace_the_table() -> None:
     """Extended to below the camera, its plane is the lower of the two."""
 
     def wedge(origin: Array, rays: Array) -> Array:
-        """Rise by 4 degrees from 3 cm above the table."""
+        """Return the depth of a face that rises by 4 degrees, from 3 cm above the table."""
         t = (0.037 + 0.07 * origin[1] - origin[2]) / (rays[..., 2] - 0.07 * rays[..., 1])
         point = origin + t[..., None] * rays
         return np.where((abs(point[..., :2]) < 0.11).all(axis=-1), t, np.inf)

@@ -146,7 +146,7 @@ def test_large_segment_cut_by_border_is_rejected_as_arm(cells: int, border: floa
 
 @pytest.mark.parametrize(("cells", "rejected"), [(29, True), (31, False)])
 def test_tiny_segment_is_rejected_before_holes_are_filled(cells: int, rejected: bool) -> None:
-    """Otherwise it would split a hole in an object."""
+    """Otherwise the segment would split a hole in an object."""
     grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, DISCONTINUITY)
     found = find_background(_blank(2), _features(cells), grid, DetectionSettings(), ALWAYS)
     assert found[1] == rejected  # the smallest object covers 60 cells here
@@ -223,7 +223,7 @@ def test_image_border_is_where_samples_begin() -> None:
 
 
 def test_hole_is_filled_with_enclosing_object() -> None:
-    """A can before the ring hides part of the hole, but does not get the rest."""
+    """A can in front of the ring hides part of the hole, but does not get the rest."""
     inv_depth = np.full((40, 40), 1.25, np.float32)
     labels, filled = np.zeros((40, 40), np.int16), np.zeros((40, 40), np.uint8)
     labels[10:30, 10:30] = 1
@@ -236,7 +236,7 @@ def test_hole_is_filled_with_enclosing_object() -> None:
 
 
 def test_gap_between_two_boxes_is_no_hole() -> None:
-    """Each box has half of its boundary."""
+    """Each box has half of the boundary of the gap."""
     inv_depth = np.full((40, 40), 1.25, np.float32)
     labels, filled = np.zeros((40, 40), np.int16), np.zeros((40, 40), np.uint8)
     labels[10:30, 5:35] = 1
@@ -248,7 +248,10 @@ def test_gap_between_two_boxes_is_no_hole() -> None:
 
 @pytest.mark.parametrize(("width", "torn", "filled"), [(20, 0, True), (20, 3, True), (5, 0, False)])
 def test_mouth_of_cup_seen_from_above_is_filled(width: int, torn: int, filled: bool) -> None:
-    """The rim is in front of the floor; in a handle, the hole is small. Edges may lack depth."""
+    """A floor is behind its rim like background in a handle, whose hole is smaller.
+
+    Edges may lack depth.
+    """
     inv_depth = np.full((40, 40), 1.25, np.float32)
     labels, cells = np.zeros((40, 40), np.int16), np.zeros((40, 40), np.uint8)
     hole = slice(20 - width // 2, 20 - width // 2 + width)
@@ -262,7 +265,7 @@ def test_mouth_of_cup_seen_from_above_is_filled(width: int, torn: int, filled: b
 
 
 def test_background_of_large_image_is_no_hole() -> None:
-    """Its open sides (six gaps of a rack) times the number of cells exceed 32 bits."""
+    """The product of its open sides (six gaps of a rack) and its cells exceeds 32 bits."""
     inv_depth = np.full((632, 632), 0.5, np.float32)
     labels, filled = np.zeros((632, 632), np.int16), np.zeros((632, 632), np.uint8)
     labels[[0, 3]] = labels[:, [0, -1]] = 1

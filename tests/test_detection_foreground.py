@@ -60,7 +60,7 @@ def test_oriented_points_have_surface_normals() -> None:
 
 
 def test_parallel_planes_have_one_normal() -> None:
-    """A box of 12 cm on a table; noise tilts planes that are fitted alone."""
+    """A box of 12 cm is on a table; noise would tilt planes that are fitted separately."""
     rng = np.random.default_rng(0)
     inv_depth = level(0.7)
     inv_depth[90:180, 110:220] = level(0.58)[90:180, 110:220]
@@ -97,7 +97,7 @@ def test_points_within_margin_of_outline_are_inside() -> None:
 
 @pytest.mark.parametrize(("closed", "kept"), [(True, 1), (False, 2)])
 def test_board_is_a_supporting_plane_unlike_box_top(closed: bool, kept: int) -> None:
-    """Both are 15 cm above the floor and equally large; the box is closed below its edge."""
+    """Both are 15 cm above the floor and equally large; only the box is closed below its edge."""
     inv_depth = level(0.9)
     z = -0.75 / RAY_HEIGHTS
     forward = np.array([0, -np.sqrt(0.5), np.sqrt(0.5)])
@@ -117,7 +117,7 @@ def test_board_is_a_supporting_plane_unlike_box_top(closed: bool, kept: int) -> 
 
 
 def test_large_upright_face_is_a_wall_unlike_small_one() -> None:
-    """Both are a metre before the camera, which looks ahead."""
+    """Both faces are a metre in front of the camera, which looks straight ahead."""
     up = np.array([0.0, -1.0, 0.0])
     trials = draw_trials(np.random.default_rng(0))
     grid = grid_of(np.ones((240, 320), np.float32))
@@ -194,7 +194,7 @@ def test_outline_of_object_rises_on_all_sides() -> None:
 
 
 def test_high_pass_keeps_step_and_removes_slope() -> None:
-    """It subtracts the mean in a window."""
+    """The filter subtracts the mean in a window."""
     residual = np.asarray(0.001 + 1e-6 * (I + J), np.float32)
     residual[120:126, 160:166] += 0.005
     high_pass = np.zeros_like(residual)

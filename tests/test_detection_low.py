@@ -28,7 +28,7 @@ def rays() -> Array:
 
 
 def depth_of(height: Array, distance: float = DISTANCE) -> Array:
-    """Return the depth of a table whose surface lies ``height`` (480, 640) metres above it."""
+    """Return the depth of a surface that lies ``height`` (480, 640) metres above a table."""
     offset = -distance * np.sin(TILT)
     return np.asarray((offset + height) / (rays() @ UP))
 
@@ -63,7 +63,7 @@ def bump(radius: float, edge: float) -> Array:
 
 @pytest.mark.usefixtures("unrejected")
 def test_depth_error_of_table_is_no_object() -> None:
-    """It exceeds the minimum height of an object."""
+    """The depth error is larger than the minimum height of an object."""
     frame = measured(depth_of(0.016 * bump(80, 90)))
     assert len(found(frame).candidates) == 0
     assert len(found(frame, low_profile=False).candidates) > 0, (
@@ -92,7 +92,7 @@ def test_plate_does_not_grow_over_adjacent_depth_error() -> None:
 
 @pytest.mark.parametrize("sensor", [KINECT, REALSENSE])
 def test_empty_tables_have_few_false_objects(sensor: Any) -> None:
-    """At most one on a dozen tables, whatever the sensor's depth error."""
+    """There is at most one on a dozen tables, whatever the sensor's depth error."""
     count = 0
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -135,7 +135,7 @@ def test_half_occluded_plate_is_an_object() -> None:
 
 
 def test_very_thin_plate_is_found_near_the_camera() -> None:
-    """There, 3 mm are many steps of the sensor."""
+    """Near the camera, 3 mm are many steps of the sensor."""
     disc = bump(60, 4)
     (one,) = found(measured(depth_of(0.003 * disc, 0.55))).candidates
     assert np.isin(np.flatnonzero(disc.reshape(-1) > 0.5), one.indices).mean() > 0.9

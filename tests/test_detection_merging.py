@@ -30,7 +30,10 @@ VIEW = ViewGeometry(INTRINSICS.fx, UP)
 
 
 def measured(depth: Array, labels: Array) -> tuple[Segments, SurfaceGraph, DepthGrid]:
-    """Measure the labels of a depth image (150, 200), metres, 0 where there is nothing."""
+    """Return the segments with these labels in a depth image (150, 200), their graph and grid.
+
+    Depth is in metres, and 0 where there is nothing.
+    """
     with np.errstate(divide="ignore"):
         inv_depth = np.where(depth > 0, 1 / depth, 0).astype(np.float32)
     grid = DepthGrid(inv_depth, INTRINSICS, 1, DISCONTINUITY)
@@ -45,7 +48,7 @@ def measured(depth: Array, labels: Array) -> tuple[Segments, SurfaceGraph, Depth
 
 
 def two_boxes(gap_m: float) -> tuple[Array, Array]:
-    """Return two front faces side by side, the right one farther away by ``gap_m``."""
+    """Return depth and labels of two faces side by side, the right one ``gap_m`` farther away."""
     depth, labels = np.zeros((150, 200)), np.zeros((150, 200), np.int16)
     depth[50:100, 50:100], labels[50:100, 50:100] = 0.8, 1
     depth[40:100, 100:140], labels[40:100, 100:140] = 0.8 + gap_m, 2
@@ -104,7 +107,7 @@ def test_features_of_two_planes_that_meet_in_a_corner() -> None:
     pair_features(segments, 1, 2, VIEW, out[0])
     relation = out["relation"][0]
     assert relation["normal_cos"] == pytest.approx(0, abs=0.1)
-    middle = (across * depth[75])[100:150].mean()  # and as far in front of the other's plane
+    middle = (across * depth[75])[100:150].mean()  # as far in front of the corner as beside it
     assert relation["second_off_first_m"] == pytest.approx(2**0.5 * middle, rel=0.1)
     assert relation["first_off_second_m"] == pytest.approx(2**0.5 * middle, rel=0.1)
     assert out["adjacency"]["concavity_deg"] == pytest.approx(90, abs=15)
@@ -121,7 +124,7 @@ def test_merging_adds_up_the_statistics() -> None:
 
 
 def behind_a_post(offset_m: float) -> tuple[Array, Array]:
-    """Return a panel at 1 m behind a post; its right part is ``offset_m`` farther away."""
+    """Return depth and labels of a panel behind a post; the right part is ``offset_m`` farther."""
     depth, labels = np.zeros((150, 200)), np.zeros((150, 200), np.int16)
     depth[50:100, 40:90], labels[50:100, 40:90] = 1.0, 1
     depth[50:100, 100:150], labels[50:100, 100:150] = 1.0 + offset_m, 2

@@ -46,7 +46,7 @@ def test_border_is_straight_in_first_lines_with_samples() -> None:
 
 
 def test_upright_box_of_rotated_box_has_its_size() -> None:
-    """Its corners are rotated by 30 degrees about an oblique up direction."""
+    """The corners are rotated by 30 degrees about an oblique up direction."""
     size = np.array([0.2, 0.1, 0.05])
     corners = (np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T) * size
     c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)

@@ -39,7 +39,7 @@ def block(x: float, y: float, z: float, size: tuple[float, float, float]) -> Mes
 
 
 def grid_of(meshes: list[Mesh], distance_m: float = 1.0) -> DepthGrid:
-    """Look down at the origin at 45 degrees, without noise."""
+    """Return the grid of a noiseless camera that looks down at the origin at 45 degrees."""
     pose = looking_at(distance_m * np.array([0, -np.sqrt(0.5), np.sqrt(0.5)]), np.zeros(3))
     here = Pose(np.eye(3), np.zeros(3))
     depth = render(geometry([(mesh, here) for mesh in meshes]), CAMERA, pose).depth
@@ -102,7 +102,7 @@ def test_strips_at_range_limit_are_no_plane(seed: int) -> None:
 
 
 def test_box_top_below_smaller_box_is_not_covered() -> None:
-    """Like a covered table, the top of the larger box has a face above it, but it is visible."""
+    """Like a covered table, the lower box has a face above its top, but the top is visible."""
     boxes = [block(0, 0, 0, (0.3, 0.3, 0.2)), block(0.05, 0.05, 0.2, (0.2, 0.2, 0.05))]
     _, covered_m2 = heights([block(0, 0, -0.03, (1.2, 1.0, 0.03)), *boxes])
     assert covered_m2 == [0] * len(covered_m2)
@@ -130,7 +130,7 @@ def test_layer_of_boxes_is_no_plane_unlike_low_cupboard() -> None:
 
 
 def test_layer_of_boxes_with_another_box_on_it_is_no_plane() -> None:
-    """The camera sees only a few centimetres into the gaps, but farther than the plane."""
+    """The camera sees only a few centimetres into the gaps, but below the plane of the tops."""
     ground, upper = block(0, 0, -0.25, (3.0, 3.0, 0.05)), block(0.3, 0.14, 0, (0.28, 0.26, 0.1))
     assert supports([ground, *layer(0.0125), upper], 1.5) == pytest.approx([-0.2], abs=0.01)
 
@@ -153,7 +153,7 @@ def test_upside_down_camera_is_accepted_for_bare_table() -> None:
 
 
 def test_up_of_camera_on_high_ceiling_is_found() -> None:
-    """Surface more than 3.2 m below the camera did not count, and a small wall beside it won."""
+    """If surfaces more than 3.2 m below the camera did not count, a small wall would win."""
     floor, wall = block(0, 0, -0.03, (6.0, 4.0, 0.03)), block(2, 0, 0, (0.1, 4.0, 2.0))
     grid = grid_of([floor, wall], distance_m=7.0)
     trials = draw_trials(np.random.default_rng(0))
@@ -164,7 +164,7 @@ def test_up_of_camera_on_high_ceiling_is_found() -> None:
 
 
 def test_assumed_plane_lies_just_below_unexplained_samples() -> None:
-    """They are 0.9 to 0.7 m below a tilted camera; far ones do not count."""
+    """The samples are 0.9 to 0.7 m below a tilted camera; far ones do not count."""
     up = np.array([0.36, -0.48, -0.8])
     i, j = np.mgrid[:120, :160]
     rays = np.stack([(j - 70) / 150, (i - 62) / 150, np.ones(i.shape)])

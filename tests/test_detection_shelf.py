@@ -58,7 +58,7 @@ def test_front_of_shelf_side_is_no_object(seed: int) -> None:
 
 
 def test_speckled_side_of_shelf_is_no_object() -> None:
-    """Many samples of an edge-on surface are missing, and the others are less steep."""
+    """Many samples of an edge-on surface are missing, and the rest look less steep."""
     assert all(np.median(candidate) >= FIRST_OBJECT for candidate in scene_labels("shelf", 335)[1])
 
 

@@ -70,7 +70,7 @@ def overlap_in_clutter(seed: int, labels: list[int]) -> float:
 
 
 def test_ball_touching_a_box_is_no_handle() -> None:
-    """Its contact with the table is hidden, but handles are not spherical."""
+    """The ball's contact with the table is hidden, but handles are not spherical."""
     assert overlap_in_clutter(690, [27]) > 0.8
 
 
@@ -88,7 +88,7 @@ def test_object_on_edge_on_top_face_is_separated(seed: int, labels: list[int]) -
 
 @pytest.mark.parametrize(("seed", "labels"), [(541, [26]), (651, [23]), (944, [29])])
 def test_object_leaning_over_another_is_separated(seed: int, labels: list[int]) -> None:
-    """It ends in the air, but is too wide for a handle or rises far above the other."""
+    """The leaning object ends in the air, but is too wide for a handle or rises far too high."""
     assert overlap_in_clutter(seed, labels) > 0.8
 
 
@@ -135,7 +135,7 @@ def can_before_a_box(rng: np.random.Generator) -> list[Shape]:
 
 
 def test_box_is_merged_across_an_occluder() -> None:
-    """A can before its middle hides where its segments meet."""
+    """A can in front of its middle hides where its segments meet."""
     assert share_found(can_before_a_box, 0.75) > 0.9
     with without("across occlusion"):
         assert share_found(can_before_a_box, 0.75) < 0.4
@@ -185,7 +185,7 @@ def flush_boxes(rng: np.random.Generator) -> list[Shape]:
 
 
 def test_stacked_boxes_with_flush_fronts_are_not_merged() -> None:
-    """Only the outline shows where one ends, and merging must keep them apart."""
+    """Only the outline shows where one box ends, and merging must keep the boxes apart."""
     assert share_found(flush_boxes, 0.75) > 0.7
     with without("width split"):
         assert share_found(flush_boxes, 0.75) < 0.1

@@ -19,7 +19,7 @@ from tests.scenes import record
 def test_every_doubt_is_looked_for(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fixed_frame: str | None, color: dict[str, str]
 ) -> None:
-    """Without a fixed frame, there are no poses to doubt, and sensors are tracked apart."""
+    """Without a fixed frame, there are no poses to doubt, and sensors are tracked separately."""
     of_poses = ["explain_jumps", "explain_misplacement", "explain_clocks"]
     of_colour = ["explain_colour_offsets"]
     for name in ("explain_missing_planes", *of_colour, *of_poses):
@@ -35,7 +35,7 @@ def test_every_doubt_is_looked_for(
 def test_changed_surfaces_are_reported_once(
     shapecat: Callable[..., Result], tmp_path: Path
 ) -> None:
-    """A model knows no others: categories were wrong, and nothing said why."""
+    """Models are trained with default surfaces: with others, categories are wrong."""
     path = record(tmp_path / "lab.mcap", 2)
     wanted = (
         "changed surface.neurons, surface.smooth_radius_m: every model is trained with the "

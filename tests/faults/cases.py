@@ -12,7 +12,7 @@ from tests.faults.injection import COUNTERS, Ended, Running
 from tests.faults.scenarios import SCENARIOS, Scenario, record_all
 
 _FIRST_S = 900.0
-"""The first run of an installation compiles kernels."""
+"""Limit for an undisturbed run: the first one of an installation compiles kernels."""
 
 
 class SkippedError(Exception):
@@ -21,7 +21,10 @@ class SkippedError(Exception):
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcome of a case."""
+    """The outcome of a case: what is ``wrong``, and exit code and stderr of the disturbed command.
+
+    ``struck`` is the time of the fault, seconds after the start, if it was set in advance.
+    """
 
     kind: str
     seed: int
@@ -140,7 +143,7 @@ class Laboratory:
             (case / "in" / name).hardlink_to(self.store / name)
 
     def _again(self, kind: str, scenario: Scenario, ended: Ended, case: Path) -> list[str]:
-        """Run the command again; results of a recording that was replaced may be replaced."""
+        """Run the command again and return what is wrong; overwrite results of a replaced input."""
         options = ("--overwrite",) if kind == "replace" and ended.code == 0 else ()
         again = Running(scenario.command(case, *options)).end()
         wrong = [f"exit code {again.code}: {again.text[-300:]}"] if again.code else []

@@ -32,7 +32,11 @@ _LINGER_S = 8.0
 
 @dataclass
 class Ended:
-    """The outcome of a command that has ended."""
+    """The outcome of a command that has ended; times are in seconds after its start.
+
+    ``lines`` are those of stderr with their times, ``struck`` is the time of the fault, and
+    ``lingering`` the number of processes that outlived the command.
+    """
 
     code: int
     seconds: float
@@ -47,7 +51,7 @@ class Ended:
         return "".join(line for _, line in self.lines)
 
     def events(self) -> list[tuple[float, dict[str, object]]]:
-        """Return the progress lines with their times."""
+        """Return the lines that are JSON objects, with their times."""
         found = []
         for moment, line in self.lines:
             with contextlib.suppress(ValueError):
@@ -83,7 +87,7 @@ class Running:
                 self.lines.append((time.monotonic() - self.begun, line))
 
     def wait_until(self, moment: float) -> bool:
-        """Wait until a time after the start; return whether the command is still running."""
+        """Wait until ``moment`` seconds after the start; return whether the command still runs."""
         try:
             self.process.wait(max(0.0, self.begun + moment - time.monotonic()))
         except subprocess.TimeoutExpired:
@@ -96,7 +100,7 @@ class Running:
             (os.killpg if group else os.kill)(self.process.pid, number)
 
     def end(self, struck: float | None = None, limit_s: float = LIMIT_S) -> Ended:
-        """Wait for the end, and for processes that outlive it."""
+        """Wait for the end of the command and of its processes; kill them if they take too long."""
         hung = self.wait_until(limit_s)
         if hung:
             self.send(signal.SIGKILL, group=True)
@@ -155,7 +159,10 @@ def _tracks_resources(process: int) -> bool:
 def replace_input(
     rng: random.Random, command: list[str], seconds: float, path: Path, other: Path
 ) -> Ended:
-    """Run a command and replace its recording: by a rename, in place, or by its first half."""
+    """Run a command, and change its recording ``path`` at a random time within ``seconds``.
+
+    It is replaced by ``other``, by a rename or in place, or cut in half.
+    """
     moment, way = rng.uniform(0.3, max(0.4, seconds)), rng.choice(["rename", "rewrite", "cut"])
     content = path.read_bytes() if way == "cut" else other.read_bytes()
     copy = path.with_suffix(".copy")
@@ -184,7 +191,7 @@ def build_shim(folder: Path) -> Path | None:
 
 
 def shimmed(library: Path, kind: str, nth: int, case: Path) -> dict[str, str]:
-    """Return the environment in which the ``nth`` call in a case folder is the first to fail."""
+    """Return the environment in which the ``nth`` call on files of ``case`` fails first."""
     counts = case.with_name(f"{case.name}.counts")
     counts.write_bytes(bytes(24))
     return {

@@ -113,7 +113,7 @@ def _read_mcap(path: Path) -> None:
 
 
 def _read_rrd_footer(path: Path) -> None:
-    """Check the last 32 bytes: start and size of the footer, a checksum, a magic number."""
+    """Check the last 32 bytes: start and size of the footer, and a magic number."""
     content = path.read_bytes()
     begin, size = struct.unpack("<QQ", content[-32:-16])
     if (
@@ -158,7 +158,7 @@ def reported(ended: Ended, until: float) -> dict[str, int]:
 
 
 def kept_frames(out: Path, run: str) -> int:
-    """Return the frames in a run folder, or in the hidden folder of an unfinished run."""
+    """Return the number of frames in a run folder, or in the hidden one of an unfinished run."""
     for folder in (out / run, out / f".{run}.partial"):
         if (folder / "frames.parquet").is_file():
             try:
@@ -208,7 +208,10 @@ def tracks(run: Path) -> list[list[str]]:
 
 
 def same_files(folder: Path, reference: Path, *, all_there: bool) -> Iterator[str]:
-    """Check that the same files exist as after the undisturbed command, with equal content."""
+    """Check that files are equal to those after an undisturbed command.
+
+    With ``all_there``, no file may be missing or stray.
+    """
     found, expected = files(folder), files(reference)
     for name in sorted(found.keys() & expected.keys()):
         if found[name] != expected[name]:

@@ -168,11 +168,14 @@ SLOW = (
     "shapecat.runs.perceive.second_look",
     "shapecat.system.stopping",
 )
-"""Judged by browsers, viewers, object storage, whole recordings or commands; not in `quick`."""
+"""Modules whose tests need browsers, viewers, storage, recordings or commands; not in `quick`."""
 
 
 def modules(only: str) -> dict[str, Path]:
-    """Return the modules without kernels whose name contains a text, by name."""
+    """Return the files of modules without kernels, by name: those whose name contains ``only``.
+
+    For ``quick``, return all but those of `SLOW`.
+    """
     folders = {package: ROOT / "shapecat" / package for package in PACKAGES} | {"cli": ROOT / "cli"}
     named = {
         ".".join(("shapecat", package, *file.relative_to(folder).with_suffix("").parts)): file

@@ -39,7 +39,7 @@ class Mutant(NamedTuple):
 
 
 class Reached(NamedTuple):
-    """The tests of a file that reach each line, by module and line, and the duration of the file.
+    """The tests of a file that reach each line, by path and line, and the seconds all of them took.
 
     An empty name stands for what runs before the first test, when modules are imported.
     """
@@ -68,10 +68,10 @@ def reach(test: Path) -> Reached | None:
 
 
 def attempt(mutant: Mutant, tests: Sequence[Path], first: Sequence[str], seconds: float) -> str:
-    """Run test files with a mutant, some tests first; return whether it survived, or its killer.
+    """Run test files with a mutant, tests ``first`` first; return ``survived`` or what killed it.
 
     ``failed``: a test failed; ``broken``: a test file could not be imported; ``late``: the tests
-    took longer than allowed.
+    took longer than ``seconds``.
     """
     process = _FORK.Process(target=_judge, args=(mutant, tests, set(first)))
     process.start()

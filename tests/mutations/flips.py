@@ -34,7 +34,7 @@ _UNARY = (ast.Not, ast.USub)
 
 
 class Flip(NamedTuple):
-    """An operator: its position among the nodes of the module, its line, and its replacement."""
+    """An operator: its position among the nodes of the module, its line, and the change."""
 
     position: int
     line: int
