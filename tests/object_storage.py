@@ -20,7 +20,7 @@ class Throttled:
     """A web application that refuses some requests, as S3 does under load, and logs all."""
 
     def __init__(self, application: Any, share: float, log: Path) -> None:
-        """Refuse a fraction of the requests."""
+        """Refuse a ``share`` of the requests to an application, and append all to ``log``."""
         self._application, self._share = application, share
         self._log = log.open("a", encoding="utf-8", buffering=1)
         self._random = random.Random(0)  # noqa: S311  no secret

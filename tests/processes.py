@@ -93,7 +93,7 @@ class DaskCluster:
         )
 
     def kill_a_worker(self) -> None:
-        """Kill the process that computes; its nanny starts another."""
+        """Kill the process in which the first worker computes; its nanny starts another."""
         for child in children(self._processes[1].pid):
             if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
                 os.kill(child, signal.SIGKILL)

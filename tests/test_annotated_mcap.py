@@ -120,7 +120,7 @@ def annotate(source: Path, target: Path, **options: Any) -> None:
 def test_recording_that_cannot_be_copied_gives_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A thread copies the recording: without its error, a file of zeros would look complete."""
+    """If an error of the thread that copies were lost, a file of zeros would look complete."""
 
     def fill_disk(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -234,7 +234,7 @@ def test_original_channels_keep_their_ids(tmp_path: Path, *, markers: bool) -> N
 
 
 def test_summary_checksum_is_correct(tmp_path: Path) -> None:
-    """Readers of other languages verify it; the Python library does not."""
+    """Readers in other languages verify the checksum; the Python library does not."""
     import zlib  # noqa: PLC0415  # only here
 
     target = tmp_path / "out.mcap"

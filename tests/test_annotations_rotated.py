@@ -169,7 +169,7 @@ def test_markers_match_boxes(encoding: str) -> None:
 
 
 def annotated(folder: Path, frames: Iterable[AnnotationFrame], *, markers: bool = False) -> Path:
-    """Return a recording with annotations."""
+    """Annotate a recording with ``frames``; return the path of the result."""
     target = folder / "out.mcap"
     with open_recording(write_mcap(folder / "a.mcap")) as recording:
         write_annotated(recording, target, iter(frames), run={}, markers=markers)

@@ -238,7 +238,7 @@ def test_frame_of_recording_is_perceived_as_it_is(image: Any) -> None:
 
 
 def test_masked_values_are_missing(image: Any) -> None:
-    """What users masked, say all beyond their table, was perceived without notice."""
+    """What users have masked, say all beyond a table, would silently be perceived."""
     far = image.depth > np.median(image.depth)
     depth = shapecat.perceive(np.ma.array(image.depth, mask=far), intrinsics(image.camera))
     masked = np.zeros((3, 4, 3), bool)
@@ -425,7 +425,7 @@ def test_frames_of_one_topic_are_read(page_folder: Path) -> None:
 @pytest.mark.parametrize("container", ["mcap", "ros1", "ros2"])
 @pytest.mark.parametrize("read", [0, 1])
 def test_frames_of_closed_recording_are_refused(tmp_path: Path, container: str, read: int) -> None:
-    """Frames of a ROS 2 bag would end, as if there were no more; other formats gave a traceback."""
+    """In a ROS 2 bag, the frames would end as if there were no more; elsewhere, in a traceback."""
     path = record(tmp_path / "a", 5, container=container)
     with shapecat.open_recording(path) as recording:
         frames = recording.frames()
@@ -469,7 +469,7 @@ def test_frames_are_those_of_the_selection(tmp_path: Path) -> None:
 def test_model_is_read_once_until_its_file_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Reading takes longer than perceiving an image."""
+    """Reading a model takes longer than perceiving an image."""
     read: list[Path] = []
 
     def counted(path: Path) -> Guesser:

@@ -162,7 +162,7 @@ def test_complete_recordings_are_not_opened_again(
 
 
 def test_changed_work_is_not_complete(recordings: Path, one_by_one: Path) -> None:
-    """With changed content, options or settings, or a missing output, work is not complete."""
+    """Otherwise results of other content or settings are kept, or a missing output is ignored."""
 
     def status(job: Job) -> str:
         with plan_batch(job, [str(recordings)], str(one_by_one)) as batch:

@@ -72,7 +72,7 @@ def planned(source: Path, **changes: Any) -> RunInfo:
 
 
 def test_unreadable_file_is_not_skipped(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Missing permissions must be reported when the file is opened."""
+    """Skipped, it would be missing from the results without a word; opened, it gives an error."""
     secret, note = source.with_name("secret"), source.with_name("note")
     secret.write_bytes(b"#ROSBAG V2.0\n")
     note.write_bytes(b"no recording")
@@ -967,7 +967,7 @@ def test_manifest_at_url_ends_as_one_file(monkeypatch: pytest.MonkeyPatch, part_
 def test_lines_recorded_while_sending_go_into_next_part(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A megabyte takes a while to send, and recordings end meanwhile."""
+    """A megabyte takes a while to send; lines of recordings that end meanwhile would be lost."""
     monkeypatch.setattr("shapecat.batch.manifest._PART_BYTES", 1)
     place, write = "memory://meanwhile", Location.write
     manifest = RemoteManifest(place)
@@ -1128,7 +1128,7 @@ def test_content_key_changes_with_content_at_url(
 
 @pytest.mark.parametrize("name", ["Last-Modified", "Content-MD5", "Digest"])
 def test_content_key_changes_with_headers_of_a_web_server(name: str) -> None:
-    """Many send no ETag: a recording replaced by one of the same size would pass for complete."""
+    """Many servers send no ETag: a recording replaced by one of equal size would seem complete."""
     assert content_key({"size": 7, name: "one"}) != content_key({"size": 7, name: "two"})
 
 

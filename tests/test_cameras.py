@@ -56,7 +56,7 @@ def test_rectified_image_uses_p_and_raw_image_uses_k() -> None:
 def test_image_without_distortion_coefficients_is_rectified(
     model: str, coefficients: tuple[float, ...]
 ) -> None:
-    """Corrected for a fisheye lens, such an image would be bent; image_geometry agrees."""
+    """Corrected for a fisheye lens, such an image would be bent; image_geometry leaves it alone."""
     given = calibration(distortion_model=model, d=np.array(coefficients))
 
     assert camera_of_info(given, rectified=False) == (
@@ -133,7 +133,7 @@ def test_intrinsics_that_fit_no_camera_are_refused(place: int, number: float) ->
 
 
 def test_region_of_interest_shifts_principal_point() -> None:
-    """Cutting 80 columns and 30 rows moves it from (322.3, 243.9) to (242.3, 213.9)."""
+    """Cutting 80 columns and 30 rows moves the point from (322.3, 243.9) to (242.3, 213.9)."""
     camera, _ = camera_of_info(calibration(roi=region(80, 30, 400, 300)), rectified=False)
 
     assert (camera.width, camera.height) == (400, 300)

@@ -132,7 +132,7 @@ def test_projection_follows_lens_model(model: str, coefficients: tuple[float, ..
 def test_rectified_image_matches_bilinear_interpolation(k1: float) -> None:
     """Colours are random, so that swapped axes are noticed.
 
-    A lens that bends outward needs pixels beyond each border; they are black.
+    A lens that bends outward needs pixels from beyond each border, which are black.
     """
     lens = LensCamera(Camera(24, 18, 20.0, 21.0, 11.3, 8.8), "plumb_bob", (k1, 0, 0.02, 0.01, 0))
     pixels = np.random.default_rng(7).integers(0, 256, (18, 24, 3)).astype(np.uint8)
@@ -196,7 +196,7 @@ def test_closed_gaps_are_measured_in_depth_pixels() -> None:
 
 
 def test_slightly_nearer_surface_occludes_object() -> None:
-    """A cloth 10 cm before a board hides from the colour camera what the depth camera sees."""
+    """A cloth 10 cm in front of a board hides from one camera what the other one sees."""
     depth = np.full((120, 160), 1.0, np.float32)
     depth[:, 30:70] = 0.9  # the cloth belongs to no object
     frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)
@@ -244,7 +244,7 @@ def test_slit_stays_open_if_background_is_visible() -> None:
     "part", [np.s_[:, :30], np.s_[:, 120:], np.s_[:20, 30:90], np.s_[95:, 40:70], np.s_[:, :]]
 )
 def test_mask_extends_to_image_border(part: tuple[slice, slice]) -> None:
-    """Objects cut off by the border lost their edge, or the whole mask."""
+    """Objects cut off by the border would lose their edge, or the whole mask."""
     inside = np.zeros((120, 160), bool)
     inside[part] = True
     depth = np.full((120, 160), 1.0, np.float32)
@@ -506,7 +506,7 @@ def test_third_object_nearby_does_not_free_the_pixels_of_its_neighbours() -> Non
 def test_masks_agree_with_simulated_colour_camera(
     tmp_path: Path, sensor: Literal["kinect", "realsense"]
 ) -> None:
-    """Lens, transform, occlusion and sensor errors together, against the rendered truth."""
+    """Errors of lens, transform, occlusion and sensor may add up; the truth is rendered."""
     from shapecat.simulation import simulate  # noqa: PLC0415  slow to load
 
     scores = []

@@ -55,7 +55,7 @@ def run(coloured_run: Path) -> Path:
 
 
 def test_masks_of_run_match_simulated_truth(run: Path) -> None:
-    """From recording to table; every object of more than 2000 pixels counts."""
+    """The way from recording to table is tested; every object of more than 2000 pixels counts."""
     source = run.parents[1] / "table.mcap"
     truth = np.load(source.with_suffix(".color_labels.npz"))["labels"]
     found = list(read_masks(run))

@@ -69,7 +69,7 @@ def test_recording_given_twice_is_named(shapecat: Run, recording: Path, tmp_path
 def test_inputs_without_a_recording_are_named(
     shapecat: Run, recording: Path, tmp_path: Path
 ) -> None:
-    """A disk that was not mounted seemed to be processed."""
+    """A disk that is not mounted would seem to be processed."""
     mount, notes = tmp_path / "mount", tmp_path / "notes.txt"
     mount.mkdir()
     notes.write_text("none")
@@ -232,7 +232,7 @@ def test_unwritable_output_is_refused_before_reading_data(
 def test_existing_model_is_kept_unless_overwritten(
     shapecat: Run, tmp_path: Path, command: tuple[str, ...]
 ) -> None:
-    """A model of hours of labelling was replaced without a word. The data set does not exist."""
+    """A model from hours of labelling would be replaced silently. The data set does not exist."""
     model = tmp_path / "mine.npz"
     save_model(model, load_model())
     content = model.read_bytes()
@@ -685,7 +685,7 @@ def test_full_disk_behind_stdout_is_reported_in_one_line(
     "line", ["print_table(['recording'], [['lab']])", "print_json(list(range(99999)))"]
 )
 def test_reader_that_leaves_early_does_not_change_the_exit_code(line: str) -> None:
-    """`process ... | head` said that recordings had failed."""
+    """`process ... | head` would exit as if recordings had failed."""
     reader, pipe = os.pipe()
     os.close(reader)
     program = f"""
@@ -734,7 +734,7 @@ def test_reader_that_leaves_early_does_not_end_an_export() -> None:
 
 
 def test_closed_stdout_does_not_change_the_exit_code(tmp_path: Path) -> None:
-    """Without stdout, `process` crashed after the work, and files got its descriptor."""
+    """Without stdout, `process` would crash after the work, and files would get its descriptor."""
     words = ["process", str(tmp_path / "missing.mcap"), "--out", str(tmp_path / "out")]
     command = ["sh", "-c", 'exec "$@" >&-', "sh", sys.executable, "-m", "shapecat", *words]
     done = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)

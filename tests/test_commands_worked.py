@@ -97,7 +97,7 @@ def test_time_left_has_hours_minutes_and_seconds() -> None:
     [(None, "shutdown"), (Stopped(2), "stop"), (KeyError("bug"), "terminate")],
 )
 def test_workers_save_their_frames_after_a_signal_only(error: Any, ended: str) -> None:
-    """Killed by Ctrl+C, they would lose frames, and leave claims and temporary folders behind."""
+    """Workers killed by Ctrl+C would lose frames, and leave claims and temporary folders."""
     calls: list[str] = []
     endings = {
         name: lambda *_, n=name: calls.append(n) for name in ("shutdown", "stop", "terminate")
@@ -476,7 +476,7 @@ CALLS = {
 def test_default_names_the_model_of_shapecat(
     shapecat: Run, monkeypatch: pytest.MonkeyPatch, line: str, target: str, option: str, model: Any
 ) -> None:
-    """`learn default` works; the same word after --model was taken for a missing file."""
+    """`learn default` works; after --model, the same word would be taken for a missing file."""
     calls: list[Any] = []
 
     def stub(*arguments: Any, **_: Any) -> Any:

@@ -400,7 +400,7 @@ def test_page_words_confidences_like_the_report(category: str, text: str) -> Non
 
 
 def worked() -> Comparison:
-    """Return a comparison in which no two numbers are equal."""
+    """Return a comparison whose metrics all differ, so that swapped ones are noticed."""
     head = "/d", 6, START
     rows = (
         Difference(*head, "outline", 11, "cup", 21, "cup", 0.91, 0.62, 0.45, 0.33),
@@ -490,7 +490,7 @@ def test_page_without_differences_has_no_empty_table() -> None:
 
 
 def test_page_shows_all_content_in_its_place() -> None:
-    """Text, tables and captions are written in this order, with HTML characters escaped."""
+    """Nothing may be lost, swapped or in another order; HTML characters must be escaped."""
     page = format_page(worked())
     figures, rows = (
         [re.findall(r"<t[hd]>(.*?)</t[hd]>", row) for row in re.findall(r"<tr>(.*?)</tr>", table)]
@@ -1378,7 +1378,7 @@ def test_images_of_other_recordings_are_left_out(run: Path) -> None:
 
 
 def test_recordings_of_runs_with_equal_names_are_told_apart(run: Path) -> None:
-    """Two batches may each have a run ``lab``, whose frames must not be compared with each other."""
+    """Two batches may each have a run ``lab``; frames of one must not count for the other."""
     head = {"recording": "lab", "topic": "/d", "frame": 0, "width": 10, "height": 10}
     content = {
         "categories": [],

@@ -47,7 +47,7 @@ def test_deeply_nested_settings_are_refused(
 
 
 def test_numbers_of_numpy_are_settings() -> None:
-    """A number computed from an image was refused: float64 "must be a number"."""
+    """A number computed from an image would be refused: float64 "must be a number"."""
     given = {
         "max_range_m": np.float64(1.5),
         "max_size_m": np.float32(0.5),

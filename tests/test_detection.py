@@ -753,7 +753,7 @@ def test_top_of_small_table_is_a_supporting_plane() -> None:
 
 
 def world_points(shapes: list[Shape], turn_deg: float, seed: int) -> Array:
-    """Return the points that a camera sees from one side, in the world frame."""
+    """Return the points (n, 3) of a camera turned by ``turn_deg`` about z, in the world frame."""
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 

@@ -121,7 +121,7 @@ def test_floor_of_raised_bin_is_a_plane_unlike_box_top() -> None:
 
 
 def test_layer_of_boxes_is_no_plane_unlike_low_cupboard() -> None:
-    """From 1.5 m, gaps of 1 cm are hardly visible. Objects stand on a cupboard."""
+    """From 1.5 m, gaps of 1 cm are hardly visible; a cupboard without gaps supports objects."""
     ground, cup = block(0, 0, -0.25, (3.0, 3.0, 0.05)), block(0.1, 0.05, 0, (0.06, 0.06, 0.08))
     cupboard, book = block(0, 0, -0.2, (0.8, 0.6, 0.2)), block(0.1, 0.05, 0, (0.15, 0.1, 0.03))
     assert supports([ground, *layer(0.01)], 1.5) == pytest.approx([-0.2], abs=0.01)

@@ -88,7 +88,7 @@ def test_object_on_edge_on_top_face_is_separated(seed: int, labels: list[int]) -
 
 @pytest.mark.parametrize(("seed", "labels"), [(541, [26]), (651, [23]), (944, [29])])
 def test_object_leaning_over_another_is_separated(seed: int, labels: list[int]) -> None:
-    """The leaning object ends in the air, but is too wide for a handle or rises far too high."""
+    """The leaning one ends in the air, but is wider than a handle or rises far above the other."""
     assert overlap_in_clutter(seed, labels) > 0.8
 
 

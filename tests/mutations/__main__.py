@@ -192,7 +192,7 @@ def modules(only: str) -> dict[str, Path]:
 
 
 def sample(seed: int, count: int | None, only: str) -> list[Mutant]:
-    """Return the mutants that a seed ranks first."""
+    """Return the ``count`` mutants that a seed ranks first, or all; ``only`` is as in `modules`."""
     mutants = [
         Mutant(name, file, flip)
         for name, file in modules(only).items()

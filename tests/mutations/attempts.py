@@ -68,7 +68,7 @@ def reach(test: Path) -> Reached | None:
 
 
 def attempt(mutant: Mutant, tests: Sequence[Path], first: Sequence[str], seconds: float) -> str:
-    """Run test files with a mutant, tests ``first`` first; return ``survived`` or what killed it.
+    """Run test files with a mutant, beginning with ``first``; return ``survived`` or its killer.
 
     ``failed``: a test failed; ``broken``: a test file could not be imported; ``late``: the tests
     took longer than ``seconds``.
