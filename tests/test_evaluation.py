@@ -120,7 +120,10 @@ def test_balanced_accuracy_ignores_categories_without_views() -> None:
 
 
 def half_of(shape: str, size: float, rng: np.random.Generator) -> F4:
-    """Return points on the side of a ball or box that is visible from +x, +y and above."""
+    """Return noisy points (n, 3) of a shape that stands at z = 0, seen from +x, +y and above.
+
+    ``size`` is its radius or half its width; both in metres.
+    """
     points = rng.normal(size=(12_000, 3))
     if shape == "ball":
         points /= np.linalg.norm(points, axis=1, keepdims=True)
@@ -136,7 +139,7 @@ def half_of(shape: str, size: float, rng: np.random.Generator) -> F4:
 def write_dataset(
     root: Path, shapes: tuple[str, ...], *, instances: int = 5, seed: int = 0
 ) -> Path:
-    """Write two views of each instance; `unknown` holds posts."""
+    """Write two views of each instance of the shapes (``unknown``: posts); return ``root``."""
     rng = np.random.default_rng(seed)
     for name in shapes:
         for instance in range(instances):
@@ -158,7 +161,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_model_is_trained_and_evaluated_on_folders(trained: Path, tmp_path: Path) -> None:
-    """Users do this with corrected crops; the instances of the evaluation are new."""
+    """Users train on corrected crops. The evaluation uses instances the model has not seen."""
     dataset = write_dataset(tmp_path / "data", ("box", "ball", "unknown"), instances=3, seed=9)
     report = evaluate_folder(dataset, trained)
     values = json.loads(json.dumps(report.as_dict()))
@@ -179,7 +182,7 @@ def test_model_is_trained_and_evaluated_on_folders(trained: Path, tmp_path: Path
 def test_evaluation_is_reproducible(
     shapecat: Callable[..., Result], trained: Path, tmp_path: Path
 ) -> None:
-    """Reports of two models are compared by eye and by scripts; only the models may differ."""
+    """Users compare the reports of two models: any difference must come from the models."""
     dataset = write_dataset(tmp_path / "data", ("box", "ball", "unknown"), instances=3, seed=9)
     command = ("evaluate", dataset, "--model", trained, "--report", tmp_path / "page.html")
     results = []
@@ -200,7 +203,10 @@ def test_training_on_folder_is_reproducible(trained: Path, tmp_path: Path) -> No
 def test_model_is_calibrated_on_held_out_instances(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The saved model is trained on all, so it has the calibration of an earlier model."""
+    """Calibrated on the views it learned, a model would be overconfident.
+
+    The saved model has learned all views, so it takes the calibration of one that has not.
+    """
     made: list[Categorizer] = []
 
     def fit(*views: DescribedViews, **options: Any) -> Categorizer:
@@ -219,7 +225,7 @@ def test_model_is_calibrated_on_held_out_instances(
 
 
 def test_new_category_is_learned_from_folder(trained: Path, tmp_path: Path) -> None:
-    """Crops of unknown objects beside those of the new category are no category."""
+    """Crops of unknown objects beside the new category must not become a category as well."""
     dataset = write_dataset(tmp_path / "new", ("plate", "unknown"))
     done = learn_on_folder(trained, dataset, tmp_path / "m.npz")
     assert (done["added"], done["categories"]) == (["plate"], ["box", "ball", "plate"])
@@ -286,7 +292,7 @@ def test_folder_with_decomposed_accents_is_told_from_its_category(tmp_path: Path
 
 
 def test_too_many_categories_are_refused_before_views_are_described(tmp_path: Path) -> None:
-    """It would fail only after the fit. The default model has seven categories."""
+    """Otherwise the error comes only after the fit. The default model has seven categories."""
     for k in range(255):
         (tmp_path / "data" / f"kind {k}" / "x").mkdir(parents=True)
         (tmp_path / "data" / f"kind {k}" / "x" / "0.npz").touch()
@@ -298,7 +304,7 @@ def test_too_many_categories_are_refused_before_views_are_described(tmp_path: Pa
 
 
 def test_categories_without_usable_views_are_named(trained: Path, tmp_path: Path) -> None:
-    """Otherwise the model already knows all categories, or lacks one without notice."""
+    """Otherwise `learn` would claim to know all categories, and `train` would silently omit one."""
     dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
     (dataset / "pen" / "x").mkdir(parents=True)
     for k in range(3):
@@ -344,7 +350,7 @@ def test_train_prints_the_accuracy_on_held_out_objects(
 def test_views_in_another_frame_are_noticed(
     shapecat: Callable[..., Result], trained: Path, tmp_path: Path
 ) -> None:
-    """A category learned from clouds in the frame of the camera recognizes nothing."""
+    """A category learned from clouds in the camera frame would match no object of a run."""
     dataset = write_dataset(tmp_path / "data", ("ball", "plate", "unknown"), instances=2)
     plates, model = list((dataset / "plate").glob("*/*.npz")), tmp_path / "m.npz"
     shift(dataset / "ball" / "ball_0" / "1.npz", -0.06)
@@ -373,7 +379,7 @@ def shift(view: Path, by_m: float) -> None:
 
 
 def test_evaluation_on_untrained_category_raises(trained: Path, tmp_path: Path) -> None:
-    """Counted as wrong, it would distort the metrics without notice."""
+    """Counted as wrong, its views would distort the metrics without notice."""
     dataset = write_dataset(tmp_path / "data", ("plate",), instances=1)
 
     with pytest.raises(ModelError, match="does not know plate"):
@@ -391,7 +397,7 @@ def test_training_needs_two_categories(tmp_path: Path) -> None:
 def test_model_is_called_calibrated_only_if_half_of_its_categories_were_held_out(
     tmp_path: Path, more: tuple[str, ...], *, calibrated: bool
 ) -> None:
-    """Users act on the confidence; of a single object, no view can be held out."""
+    """Users act on the confidence. A category with a single object has no views to hold out."""
     dataset = write_dataset(tmp_path / "data", ("box",), instances=3)
     write_dataset(dataset, ("ball", *more), instances=1)
     done = train_on_folder(dataset, tmp_path / "m.npz")
@@ -505,7 +511,7 @@ def test_report_metrics_match_hand_calculation() -> None:
     assert report.confusion == ((2, 2), (1, 1))
     assert report.rejected_known == pytest.approx(2 / 6)
     assert report.novelty == {"n": 2, "auroc": pytest.approx(8 / 12), "rejected": 0.5}
-    # The views of a: 0.9 * 0.8 * 0.4 against 0.1 * 0.2 * 0.6. Those of c and a would be a can.
+    # The views of a: 0.9 * 0.8 * 0.4 against 0.1 * 0.2 * 0.6. Fused with c, they would be a can.
     assert [(one.views, one.groups, one.accuracy) for one in report.fused] == [(3, 1, 1.0)]
     assert [row[:2] for row in report.by_distance] == [
         ("0-0.8 m", 1), ("0.8-1.1 m", 3), ("1.1-1.4 m", 1), ("1.7 m or more", 1)
@@ -672,7 +678,7 @@ def test_html_and_markdown_have_each_number_in_its_place() -> None:
         for block in blocks
         if block[0].startswith("|")
     ]
-    assert written == [[[""], *tables[0]], *tables[1:]]  # its head is empty
+    assert written == [[[""], *tables[0]], *tables[1:]]  # the first table has an empty head
     assert [b[0].removeprefix("## ") for b in blocks if b[0].startswith("##")] == heads
     assert blocks[0] == ["# a\\|b &amp; c"]
     for content in (page, text):
@@ -686,13 +692,13 @@ def test_html_and_markdown_have_each_number_in_its_place() -> None:
 
 
 def drawn(svg: str, kind: str, *names: str) -> list[tuple[str | None, ...]]:
-    """Return some attributes of all elements of a kind; ``text`` is their content."""
+    """Return the attributes ``names`` of each element of a kind; ``text`` is its content."""
     found = [e for e in ET.fromstring(svg).iter() if e.tag.endswith(kind)]  # noqa: S314  ours
     return [tuple(e.text if n == "text" else e.get(n) for n in names) for e in found]
 
 
 def test_report_pictures_are_drawn_to_scale() -> None:
-    """Shades show fractions of a row, areas of dots and thicknesses of bars numbers of views."""
+    """Shades show fractions of a row; dot areas and bar thicknesses show numbers of views."""
     report = worked()
     cells = drawn(confusion_svg(report.categories, report.confusion), "rect", "x", "y", "fill")
     ink = np.array([31, 78, 121])
@@ -773,7 +779,7 @@ def test_command_writes_the_page(
 
 
 def test_reports_of_other_formats_are_refused(tmp_path: Path) -> None:
-    """HTML under the name of a PDF opens nowhere, and would replace a model."""
+    """HTML named .pdf opens nowhere; named .npz, it could replace a model."""
     page = tmp_path / "mine.npz"
     page.write_text("a model")
     command = import_module("shapecat.cli.evaluate").evaluate
@@ -796,7 +802,7 @@ def compared(
 
 
 def test_baselines_are_compared_with_shapecat(compared: Report, tmp_path: Path) -> None:
-    """All have the same views, except that baselines do not learn from unknown shapes."""
+    """All classifiers get the same views, but baselines do not learn from unknown shapes."""
     names = [item.learner for item in compared.baselines]
 
     assert names[:4] == ["shapecat", "forest", "linear", "pnn"]
@@ -813,7 +819,7 @@ def test_baselines_are_compared_with_shapecat(compared: Report, tmp_path: Path) 
 def test_training_views_of_cross_validation_are_mean_over_folds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Where one object has most views, those of the first fold alone were a tenth of the others."""
+    """The first fold's count was reported: far too low if it leaves out an object of many views."""
     sizes = {"cup": [3, 3, 3, 200], "can": [3, 4, 5, 6], "unknown": [8]}
     labels = np.repeat(list(sizes), [sum(views) for views in sizes.values()])
     objects = np.repeat(np.arange(9), np.concatenate(list(sizes.values()))).astype(str)
@@ -845,7 +851,7 @@ def test_few_unknown_shapes_are_no_problem_for_cross_validation() -> None:
 
 @pytest.mark.usefixtures("few_trees")
 def test_baselines_may_have_their_own_training_set(trained: Path, tmp_path: Path) -> None:
-    """It may have other categories in another order: each baseline has its own columns."""
+    """Its categories may be others, in another order, so posteriors have columns of their own."""
     train = write_dataset(tmp_path / "train", ("ball", "box", "plate"), instances=3, seed=3)
     test = write_dataset(tmp_path / "test", ("box", "ball"), instances=2, seed=4)
     report = evaluate_folder(test, trained, baselines=train)
@@ -855,7 +861,7 @@ def test_baselines_may_have_their_own_training_set(trained: Path, tmp_path: Path
 
 
 def test_baselines_are_not_tested_on_objects_they_learned(trained: Path, tmp_path: Path) -> None:
-    """All runs in one data set and one of them in another gave figures that are too good."""
+    """Training on all runs and testing on one of them gave figures that were too good."""
     train = write_dataset(tmp_path / "train", ("ball", "box"), instances=3, seed=3)
     test = write_dataset(tmp_path / "test", ("ball", "box"), instances=2, seed=4)
     path = train / "box" / "box_1" / "0.npz"

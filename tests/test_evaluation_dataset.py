@@ -83,7 +83,7 @@ def test_fields_of_several_values_shift_later_fields(tmp_path: Path, encoding: s
 
 
 def test_blank_lines_between_points_are_skipped(tmp_path: Path) -> None:
-    """The last points would be missing."""
+    """If blank lines counted as points, the last points would be missing."""
     path = tmp_path / "x.pcd"
     head, body = pcd("ascii").split(b"ascii\n")
     path.write_bytes(head + b"ascii\n" + body.replace(b"\n", b"\n\n"))
@@ -93,7 +93,7 @@ def test_blank_lines_between_points_are_skipped(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_every_encoding_of_ply_is_read(tmp_path: Path, kind: str) -> None:
-    """Faces may follow the vertices."""
+    """Faces that follow the vertices must not be read as points."""
     head = (
         f"ply\nformat {kind} 1.0\ncomment VIEWPOINT 0.5 -0.25 1.25\nelement vertex 3\n"
         "property uchar red\nproperty float x\nproperty float y\nproperty double z\n"
@@ -136,7 +136,7 @@ def test_files_of_open3d_are_read(tmp_path: Path) -> None:
 def test_damaged_cloud_raises_or_is_read(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
-    """It must not crash or allocate more than the file can fill."""
+    """The reader must not crash, or return more points than the file has bytes."""
     encoding = data.draw(st.sampled_from(["ascii", "binary", "binary_compressed"]))
     content = bytearray(pcd(encoding))
     for _ in range(data.draw(st.integers(1, 4))):
@@ -194,7 +194,7 @@ def test_view_keeps_viewpoint_and_drops_nan(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("eye", [[0, 0, 1.25], [-0.5, 0, 0.75]])
 def test_viewpoint_may_have_coordinates_of_zero(tmp_path: Path, eye: list[float]) -> None:
-    """Only (0, 0, 0) is the default of files that state none: a camera may be right above."""
+    """Only (0, 0, 0) stands for an unknown viewpoint: a camera may be right above the object."""
     view = read_view(save(tmp_path, POINTS, viewpoint=np.array(eye)))
 
     assert view.eye.tolist() == eye
@@ -215,7 +215,7 @@ def test_views_are_sorted_by_path(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["mug/0.PCD", "mug/red/left/0.PCD"])
 def test_category_without_folders_of_objects_is_refused(tmp_path: Path, name: str) -> None:
-    """Its views were left out without notice if other categories had such folders."""
+    """Views at another depth were left out without notice if other categories were right."""
     for other in ("cup/a/0.pcd", "cup/scan.ply", name, ".mug/0.pcd"):
         (tmp_path / other).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / other).touch()
@@ -229,7 +229,7 @@ def test_category_without_folders_of_objects_is_refused(tmp_path: Path, name: st
 
 
 def test_hidden_files_are_no_views(tmp_path: Path) -> None:
-    """Notebooks, macOS and waste bins leave them; the data set itself may be in a hidden folder."""
+    """Notebooks, macOS and trash folders leave some; the data set may be in a hidden folder."""
     root = tmp_path / ".cache" / "data"
     for name in ("cup/a/0.pcd", "cup/a/._0.pcd", "cup/.ipynb_checkpoints/0.pcd", ".Trash/b/0.pcd"):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -268,11 +268,11 @@ def test_pickled_points_are_not_loaded(tmp_path: Path) -> None:
 
 
 def damaged_archives() -> dict[str, bytes]:
-    """Return archives that NumPy and zipfile refuse, each with another kind of error."""
+    """Return archives that NumPy and zipfile refuse, each with a different kind of error."""
     stream = io.BytesIO()
     np.savez_compressed(stream, allow_pickle=False, points=np.random.default_rng(0).random((99, 3)))
     deflated = bytearray(stream.getvalue())
-    deflated[60:64] = b"\xff" * 4  # the first bytes behind the name
+    deflated[60:64] = b"\xff" * 4  # the first bytes after the name
     found = {"damaged deflate": bytes(deflated)}
     for name, method in (("lzma", zipfile.ZIP_LZMA), ("bzip2", zipfile.ZIP_BZIP2)):
         stream = io.BytesIO()
@@ -300,7 +300,7 @@ def damaged_archives() -> dict[str, bytes]:
 
 @pytest.mark.parametrize("kind", damaged_archives())
 def test_damaged_archives_raise_with_path(tmp_path: Path, kind: str) -> None:
-    """Each part of the reader has errors of its own."""
+    """NumPy, zipfile and the decompressors raise their own errors, which would be tracebacks."""
     path = tmp_path / "cup" / "mug" / "0.npz"
     path.parent.mkdir(parents=True)
     path.write_bytes(damaged_archives()[kind])
@@ -336,7 +336,7 @@ def test_missing_viewpoint_is_estimated(azimuth_deg: float) -> None:
 
 
 def test_view_of_many_points_gets_a_viewpoint() -> None:
-    """NumPy's set of cells takes minutes for such a cloud, as their numbers have equal hashes."""
+    """`numpy.unique` takes minutes for the cells of such a cloud: their numbers' hashes collide."""
     rng = np.random.default_rng(1)
     points = rng.normal(0, 1, (400_000, 3)) * [0.05, 0.05, 0.0005]
 

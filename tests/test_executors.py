@@ -82,7 +82,7 @@ def test_workers_do_not_load_pandas(executor: Executor) -> None:
 
 
 def test_replaced_workers_leave_nothing_open() -> None:
-    """In a batch of thousands of recordings, each that kills its worker would cost a file."""
+    """In a batch of thousands of recordings, killed workers would use up files and threads."""
 
     def kill() -> tuple[int, int]:
         assert isinstance(one.submit(kill_self).exception(), WorkerLostError)
@@ -95,7 +95,7 @@ def test_replaced_workers_leave_nothing_open() -> None:
 
 
 def test_unpicklable_task_fails_alone() -> None:
-    """Its worker must take the next one, or a batch would wait for ever."""
+    """Its worker must take the next task, or a batch would wait forever."""
     one = LocalExecutor(1)
     assert one.submit(lambda: 1).exception() is not None
     assert [one.submit(abs, -k).result(20) for k in range(3)] == [0, 1, 2]
@@ -103,7 +103,7 @@ def test_unpicklable_task_fails_alone() -> None:
 
 
 def test_cancelled_task_leaves_its_worker_free() -> None:
-    """A worker that counts it as sent gets no further task, and the command never ends."""
+    """If a cancelled task counts as sent, its worker gets no other, and the command never ends."""
     one = LocalExecutor(1)
     try:
         held = one.submit(time.sleep, 0.2)
@@ -143,7 +143,7 @@ def test_workers_have_one_thread_each(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_thread_limits_are_restored(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Libraries that are loaded later would stay as slow as those of the workers."""
+    """Libraries loaded later would also be limited to one thread, and slow."""
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     with single_threaded():
@@ -168,7 +168,7 @@ def test_terminate_kills_running_tasks(tmp_path: Path) -> None:
 
 
 def _refuse_threads(monkeypatch: pytest.MonkeyPatch, target: str, *, after: int = 0) -> None:
-    """Refuse further threads that run a method, as a limit of processes does."""
+    """Let only ``after`` threads run the method ``target``, as a limit of processes would."""
     start, started = threading.Thread.start, count()
 
     def limited(thread: threading.Thread) -> None:
@@ -245,7 +245,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
 
 
 def test_progress_arrives_and_missing_receivers_are_ignored(tmp_path: Path) -> None:
-    """A name has up to 255 bytes, here six in JSON each: a cut message would be dropped."""
+    """A name of 255 bytes can take six times as many in JSON; a cut message would be dropped."""
     received: SimpleQueue[Any] = SimpleQueue()
     longest = [os.fsdecode(b"\xff" * 255), "perceive", 10**12, 10**13]
     messages = [["kitchen", 3], longest, ["厨房" * 42, "track", 0, None], ["hall", 4]]
@@ -261,7 +261,7 @@ def test_progress_arrives_and_missing_receivers_are_ignored(tmp_path: Path) -> N
 def test_long_temporary_folder_costs_at_most_the_reports(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, places: str
 ) -> None:
-    """The path of a socket has at most 107 bytes, and clusters give each job a long one."""
+    """A socket's path has at most 107 bytes; clusters give each job a long temporary folder."""
     long = tmp_path / ("d" * 82)
     long.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(long))
@@ -354,7 +354,7 @@ def test_ray_that_does_not_start_is_not_blamed_on_a_scheduler(
 
 
 def test_ray_keeps_no_result_of_a_finished_call(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A batch may have millions of recordings, and the end would wait for each again."""
+    """A batch may have millions of recordings, and shutdown would wait for each of them again."""
 
     class Reference:
         def __init__(self, *_: Any) -> None:
@@ -423,7 +423,7 @@ def test_dask_logs_no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_dask_runs_equal_calls_separately() -> None:
-    """The retry of a recording whose worker died is the same call; a cached result would end it."""
+    """A recording whose worker died is retried with the same call: no cached result may answer."""
     distributed = pytest.importorskip("distributed")
     client = distributed.Client(processes=False, n_workers=1, dashboard_address="127.0.0.1:0")
     with _DaskExecutor(client, None) as executor:
@@ -433,7 +433,7 @@ def test_dask_runs_equal_calls_separately() -> None:
 
 
 def test_dask_without_a_worker_is_known_to_wait() -> None:
-    """The command was silent until a worker came, for example if none could start."""
+    """While no worker had started, the command waited without saying why."""
     distributed = pytest.importorskip("distributed")
     cluster = distributed.LocalCluster(
         n_workers=0, processes=False, dashboard_address="127.0.0.1:0"
@@ -449,7 +449,7 @@ def test_dask_without_a_worker_is_known_to_wait() -> None:
 def test_lost_dask_scheduler_is_a_known_error(status: str) -> None:
     """Dask closes the client of a scheduler that does not come back within half a minute.
 
-    A call submitted to a closed client was a traceback, and to one that was closing never ended.
+    A call to a closed client ended in a traceback; a call to a closing one never ended.
     """
 
     class ClosedClientError(Exception):
@@ -567,7 +567,7 @@ def test_errors_are_raised_in_order() -> None:
 
 
 def test_error_that_cannot_be_unpickled_fails_only_its_task() -> None:
-    """Otherwise the caller would wait for ever."""
+    """Otherwise the caller would wait forever."""
     with LocalExecutor(1) as executor:
         failing, after = executor.submit(raise_unreadable), executor.submit(abs, -3)
         with pytest.raises(TypeError, match="number"):
@@ -576,7 +576,7 @@ def test_error_that_cannot_be_unpickled_fails_only_its_task() -> None:
 
 
 def test_records_are_read_only_after_transfer() -> None:
-    """A result could change its input, and kernels would be compiled again for such arrays."""
+    """With writable arrays, a task could change its input, and kernels would be compiled again."""
     sent = Frame(
         "a", 0, 0, 0, "c", depth=np.ones((4, 5), np.float32), camera=Camera(5, 4, 3, 3, 2, 2)
     )

@@ -35,7 +35,7 @@ Run = Callable[..., Result]
 
 @pytest.fixture(scope="module")
 def run(guessed_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Correct a run: one track deleted, one a new category with a blank, one unknown."""
+    """Return a corrected run: track 1 deleted, 2 of a new category with a blank, 3 unknown."""
     folder = tmp_path_factory.mktemp("corrected") / "table"
     shutil.copytree(guessed_run, folder)
     relabel(folder, {1: "delete", 2: "wine glass", 3: "unknown"})
@@ -52,9 +52,9 @@ def relabel(folder: Path, labels: dict[int, str]) -> None:
 
 
 def boxes(folder: Path, which: str = "_full") -> dict[int, list[tuple[int, np.ndarray]]]:
-    """Return for each frame the track and the corners (8, 3) of its boxes, from the tables.
+    """Return for each frame the track and the corners (8, 3) of each box, read from the tables.
 
-    Full boxes are from the tracks; visible boxes (if ``which`` is empty) are from the detections.
+    Full boxes are those of tracks; visible boxes (``which`` is empty) are those of detections.
     """
     owner = {
         (row["frame"], row["detection"]): row
@@ -76,7 +76,7 @@ def boxes(folder: Path, which: str = "_full") -> dict[int, list[tuple[int, np.nd
 
 
 def farthest(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the largest distance from corners (8, 3) to the nearest of other corners."""
+    """Return the largest distance of a corner in ``a`` or ``b`` (8, 3) from the other box's."""
     distances = np.linalg.norm(a[:, None] - b[None], axis=-1)
     return float(max(distances.min(axis=0).max(), distances.min(axis=1).max()))
 
@@ -99,7 +99,7 @@ def test_crops_are_a_data_set_with_corrected_labels(run: Path, tmp_path: Path) -
 
 
 def test_crops_are_upright_at_height_zero_with_viewpoint(run: Path, tmp_path: Path) -> None:
-    """In any other frame, the descriptors would differ."""
+    """In another frame, a view would have other descriptors than in the run."""
     export_run(read_finished(run), "crops", tmp_path)
     truth = json.loads(
         (Path(read_finished(run).info["input"]["path"]).with_suffix(".truth.json")).read_text()
@@ -329,7 +329,7 @@ def test_runs_exported_together_share_category_numbers(
 
 
 def test_numbers_of_categories_depend_on_their_names_alone(run: Path, tmp_path: Path) -> None:
-    """An export of runs in another order, or of a model that learned them, cannot be added."""
+    """Otherwise exports of runs in another order, or with a later model, could not be combined."""
     runs = [tmp_path / name for name in "ab"]
     for folder, label in zip(runs, ("zebra", "apple"), strict=True):
         shutil.copytree(run, folder)
@@ -396,7 +396,7 @@ def test_frames_without_pose_are_left_out(run: Path, tmp_path: Path, format: str
 
 
 def test_export_never_replaces_its_run(run: Path) -> None:
-    """`--out results` names the folder that contains the run."""
+    """With `--out results`, the folder that contains the run, an export would replace the run."""
     before = sorted(path.name for path in run.iterdir())
 
     with pytest.raises(OutputError, match="choose another --out"):
@@ -406,7 +406,7 @@ def test_export_never_replaces_its_run(run: Path) -> None:
 
 
 def test_export_replaces_only_export_of_same_format(run: Path, tmp_path: Path) -> None:
-    """Its marker states the source, so that no export of another one is replaced."""
+    """An export states its format and source, so that no other is replaced by mistake."""
     folder = shutil.copytree(run, tmp_path / "table")
     info = read_run(folder)
     info["options"] |= {"start_s": 0.0, "end_s": 99.5}
@@ -451,7 +451,7 @@ def test_missing_or_changed_recording_is_refused(run: Path, tmp_path: Path) -> N
 
 
 def several_runs(run: Path, results: Path) -> None:
-    """Copy a run as a to d; the recordings of b and c are missing, and a label of d is invalid."""
+    """Copy a run to folders a to d; b and c lack their recordings, and a label of d is invalid."""
     for name in "abcd":
         shutil.copytree(run, results / name)
         place = results / name / "run.json"
@@ -488,7 +488,7 @@ def test_runs_with_errors_are_named_and_skipped(
 
 
 def test_export_without_usable_run_fails(shapecat: Run, run: Path, tmp_path: Path) -> None:
-    """It has the exit code that all of its runs share."""
+    """The exit code is that of the runs if they all share one, otherwise 1."""
     results, out = tmp_path / "results", tmp_path / "out"
     several_runs(run, results)
     for names, code in (("bc", 3), ("bd", 1)):
@@ -546,7 +546,7 @@ def test_scene_follows_corrections(shapecat: Run, run: Path, tmp_path: Path) -> 
 
 
 def test_crops_of_ranges_within_a_second_are_told_apart() -> None:
-    """Those of 0 to 1.4 s would replace those of 1.4 to 2.4 s, rounded to whole seconds."""
+    """Rounded to whole seconds, 0 to 1.4 s and 1.4 to 2.4 s could replace each other."""
     first, second = Origin("0123456789ab", 0.0, 1.4), Origin("0123456789ab", 1.4, 2.4)
 
     assert Origin.read(f"lab.{second}.track-3") == second

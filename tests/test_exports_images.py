@@ -39,7 +39,7 @@ BAND_PX = 6
 
 @pytest.fixture(scope="module")
 def run(coloured_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Correct a run: one track deleted, one a new category with a blank."""
+    """Return a corrected run: track 1 is deleted, 2 has a new category with a blank."""
     folder = tmp_path_factory.mktemp("corrected") / "table"
     shutil.copytree(coloured_run, folder)
     relabel(folder, {1: "delete", 2: "wine glass"})
@@ -103,7 +103,7 @@ def test_coco_has_original_images_and_masks_of_tracks(run: Path, tmp_path: Path)
 
 
 def nearest(box: list[int], others: Iterable[tuple[int, int, int, int]]) -> int:
-    """Return the difference of the sides of a box from those of the most similar other box."""
+    """Return how far the sides of a box (x, y, w, h) are from those of the most similar, pixels."""
     sides = np.add(box, [0, 0, *box[:2]])
     return min(int(np.abs(np.add(o, [0, 0, *o[:2]]) - sides).max()) for o in others)
 
@@ -192,7 +192,7 @@ def test_yolo_polygons_cover_masks(run: Path, tmp_path: Path) -> None:
 
 
 def drawing(corners: Any, height: int, width: int) -> Any:
-    """Fill a polygon, four times finer than pixels."""
+    """Return the pixels (height, width) that are more than half inside a polygon (n, 2)."""
     image = Image.new("L", (4 * width, 4 * height))
     ImageDraw.Draw(image).polygon([tuple(4 * corner) for corner in corners], fill=16)
     return np.asarray(image.reduce(4)) > 8  # the number of filled sixteenths of each pixel
@@ -223,9 +223,9 @@ def test_parts_of_object_are_joined_into_one_polygon() -> None:
 
 
 def test_outlines_are_sorted_by_area_and_links_add_none() -> None:
-    """The first part frames the crop of an object; COCO tools compute areas of polygons.
+    """Links must add no area, since COCO tools compute areas from the polygons.
 
-    A hole is no part: linked to its object, it would take these pixels from it.
+    A hole is no part: linked to the outline, it would be subtracted from the object.
     """
     pixels = np.zeros((20, 40), bool)
     pixels[1:3, 30:34], pixels[4:19, 2:14], pixels[9:15, 20:27] = True, True, True
@@ -428,7 +428,7 @@ def test_images_with_equal_stamps_are_all_exported(coloured_run: Path, tmp_path:
 def test_no_frames_are_kept_for_views_that_are_not_labelled(
     coloured_run: Path, tmp_path: Path
 ) -> None:
-    """Objects that a person called unknown would add images without a label of theirs."""
+    """The best view of an object that a person labelled unknown would add an unlabelled image."""
     folder = tmp_path / "table"
     shutil.copytree(coloured_run, folder)
     frames = list(read_finished(folder).frames())

@@ -26,7 +26,7 @@ RUNS = 5
 
 @pytest.fixture(scope="module")
 def runs(coloured_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder of runs of five recordings; in each one track is corrected."""
+    """Return a folder of runs of five recordings; in each run, one track is corrected."""
     folder = tmp_path_factory.mktemp("runs")
     for k in range(RUNS):
         shutil.copytree(coloured_run, folder / f"lab{k}")

@@ -51,7 +51,7 @@ AXES = np.array(  # in the level camera: length, width, up
     [[np.cos(YAW), 0, -np.sin(YAW)], [np.sin(YAW), 0, np.cos(YAW)], [0, -1, 0]]
 )
 PIXELS = [(40, 70), (41, 70), (63, 92), (52, 81)]
-"""Columns and rows that the object covers."""
+"""Column and row of each pixel of the object."""
 
 
 def labelled(*, cut: bool, hidden: bool) -> LabelledFrame:
@@ -134,7 +134,7 @@ def test_kitti_frame_of_depth_image_looks_along_its_camera(
 
 
 def test_kitti_calibration_projects_points_into_colour_camera(tmp_path: Path) -> None:
-    """P2 contains the pose of the camera, and the 2D box is in its pixels."""
+    """P2 contains the pose of the colour camera, and the 2D box is in pixels of its image."""
     camera = Camera(200, 150, 171.0, 166.0, 103.2, 71.5)
     pose = Pose(
         Rotation.from_euler("xyz", [0.05, -0.08, 0.03]).as_matrix(), np.array([0.06, -0.02, 0.01])
@@ -166,7 +166,7 @@ def test_kitti_calibration_projects_points_into_colour_camera(tmp_path: Path) ->
 
 
 def test_kitti_image_is_that_of_its_pinhole_camera(tmp_path: Path) -> None:
-    """P2 has no lens distortion, so what it projects must be there in image_2."""
+    """P2 has no lens distortion, so image_2 must show objects where P2 projects them."""
     camera = Camera(200, 150, 171.0, 166.0, 103.2, 71.5)
     k1, k2, p1, p2, k3 = lens = (-0.31, 0.12, 0.004, -0.003, 0.02)
     pose = Pose(
@@ -196,7 +196,7 @@ def test_kitti_image_is_that_of_its_pinhole_camera(tmp_path: Path) -> None:
 
 
 def test_kitti_image_on_depth_pixels_has_the_depth_camera(tmp_path: Path) -> None:
-    """Drivers publish registered images with the calibration of the colour camera."""
+    """Drivers publish images registered to depth with the calibration of the colour camera."""
     pixels = np.random.default_rng(1).integers(0, 256, (120, 160, 3), np.uint8)
     image = ColourImage("/color", 5, 6, "optical", "rgb8", 160, 120, 480, pixels.tobytes())
     lens = LensCamera(Camera(160, 120, 144.1, 140.3, 76.2, 62.8), "plumb_bob", (0.02, 0, 0, 0, 0))
@@ -253,7 +253,7 @@ def corners_of(center: Sequence[float], size: Any, yaw: float) -> Any:
 
 
 def corner_distance(a: Any, b: Any) -> float:
-    """Return the distance between two sets of corners, regardless of their order."""
+    """Return the largest distance from a corner in ``a`` to the nearest in ``b``."""
     return float(np.linalg.norm(a[:, None] - b[None], axis=2).min(axis=1).max())
 
 
@@ -316,7 +316,7 @@ def test_kitti_keeps_cloud_of_level_lidar(tmp_path: Path) -> None:
 
 
 def test_kitti_turns_loose_points_of_camera_like_its_image(tmp_path: Path) -> None:
-    """Taken for a laser scanner with x forward, the scene would be beside the camera."""
+    """Taken for a laser scan with x forward, the cloud would lie beside the camera."""
     cloud = Frame("/points", 0, 5, 6, "optical", points=frame().xyz())
     finished: Any = SimpleNamespace(categories=())
     found = []
@@ -352,7 +352,7 @@ def crops_frames(*topics: str) -> list[Any]:
 
 @pytest.mark.parametrize("topics", [("/left/depth", "/right/depth"), ("/a/depth", "/a_depth")])
 def test_crops_of_two_cameras_do_not_replace_each_other(tmp_path: Path, topics: Any) -> None:
-    """The frames of each topic are numbered from 0; names of files may not differ."""
+    """Frames of each topic are numbered from 0, so files of two cameras may have equal names."""
     for _ in range(2):  # the second export replaces the first
         assert write_crops(tmp_path, crops_frames(*topics), crops_run(*topics)) == 2
         (instance,) = tmp_path.glob("*/*")
@@ -362,7 +362,7 @@ def test_crops_of_two_cameras_do_not_replace_each_other(tmp_path: Path, topics: 
 
 
 def test_crops_are_replaced_whatever_the_order_of_topics(tmp_path: Path) -> None:
-    """Processed again with the options swapped, each view would be there twice."""
+    """If the topics are given in another order next time, each view would be there twice."""
     topics = ("/left/depth", "/right/depth")
     for order in (topics, topics[::-1]):
         assert write_crops(tmp_path, crops_frames(*topics), crops_run(*order)) == 2
@@ -395,7 +395,7 @@ def test_crops_of_a_renamed_run_replace_the_earlier_ones(tmp_path: Path) -> None
     ],
 )
 def test_crops_of_other_time_ranges_stay(tmp_path: Path, ranges: Any, kept: int) -> None:
-    """Those of included ranges are replaced: they show the same objects in the same frames."""
+    """Only crops of a range within the new one are replaced: they show the same frames."""
     for start, end in ranges:
         made = crops_run("/depth", start_s=start, end_s=end)
         assert write_crops(tmp_path, crops_frames("/depth"), made) == 1
@@ -450,7 +450,7 @@ def test_coco_entries_have_right_values(tmp_path: Path) -> None:
     assert [a["score"] for a in (first, second)] == [0.9, 0.4]
     attributes = {"run": "lab", "track": 4, "occluded": True, "truncated": False}
     assert first["attributes"] == attributes
-    assert second["attributes"]["truncated"]  # of such an object, a wide image has a partial mask
+    assert second["attributes"]["truncated"]  # depth cuts its mask, even if the image is wider
     assert len({a["id"] for a in (first, second)}) == len({a["track_id"] for a in (first, second)})
 
 
@@ -497,7 +497,7 @@ def test_labels_of_images_with_dots_in_their_names_stay_apart(tmp_path: Path) ->
 
 
 def test_yaml_files_hold_names_as_they_are_written(tmp_path: Path) -> None:
-    """YAML reads an escaped pair of surrogates, as JSON writes a rare character, as two."""
+    """JSON escapes a rare character as two surrogates, which YAML would read as two characters."""
     run: Any = SimpleNamespace(folder=tmp_path, labels={}, categories=("can", "𠮷 cup"))
     write_yolo(tmp_path, [], run.categories)
     cloud = Frame("/depth", 0, 5, 6, "optical", points=np.ones((2, 3), np.float32))

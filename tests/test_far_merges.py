@@ -33,7 +33,7 @@ def surface(row: dict[str, Any]) -> Any:
 
 
 def true_gaps(run: Path) -> dict[tuple[int, int], list[float]]:
-    """Return the distance between the full boxes of each two tracks, in each common frame."""
+    """Return the distance between the full boxes of each pair of tracks, in each common frame."""
     rows = pq.read_table(run / "tracks.parquet").to_pylist()
     gaps: dict[tuple[int, int], list[float]] = {}
     frames: dict[int, list[dict[str, Any]]] = {}
@@ -50,7 +50,7 @@ def true_gaps(run: Path) -> dict[tuple[int, int], list[float]]:
 def test_annotate_warns_of_merged_objects_in_different_places(
     run: Path, shapecat: Shapecat
 ) -> None:
-    """A typo in the number joined two objects in one box over half of the table, silently."""
+    """A typo in a number silently joined two objects in one box, over half of the table."""
     gaps = {pair: np.mean(values) for pair, values in true_gaps(run).items()}
     counts = {pair: len(values) for pair, values in true_gaps(run).items()}
     a, b = max(gaps, key=lambda pair: gaps[pair])

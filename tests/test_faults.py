@@ -96,7 +96,7 @@ def test_damaged_file_is_noticed(out: Path, name: str, damage: Callable[[Path], 
 
 
 def test_stray_files_and_torn_lines_are_noticed(out: Path) -> None:
-    """Half a manifest line, a file that is not a run, and a hidden folder after the end."""
+    """A fault may leave half a manifest line, a file that is not a run, or a hidden folder."""
     (out / "manifest.jsonl").write_text('{"folder": "table"}\n{"fold')
     (out / "table.partial").write_text("")
     (out / ".table.partial").mkdir()
@@ -149,7 +149,7 @@ def test_lost_frames_are_noticed(out: Path) -> None:
     ],
 )
 def test_bad_ends_are_noticed(ended: Ended, message: str) -> None:
-    """Crashes, wrong codes and processes left behind."""
+    """A command that crashes, gives a wrong code or leaves processes behind must not pass."""
     assert any(message in text for text in invariants.ended_well("interrupt", ended))
 
 

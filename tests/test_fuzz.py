@@ -31,7 +31,7 @@ FRAMES = 12
 
 
 class Outcome(NamedTuple):
-    """Exit code, stamps and number of the frames read, and the messages."""
+    """The exit code, the stamps and number of frames read, and the warnings or the error."""
 
     code: int
     stamps: frozenset[int]
@@ -98,7 +98,7 @@ def read(path: Path) -> Outcome:
 
 
 def chunk_ends(path: Path) -> list[tuple[int, int]]:
-    """Return the end of each chunk and the number of frames that are whole before it."""
+    """Return, for each chunk, the offset of its end and the number of frames complete by then."""
     with path.open("rb") as file:
         if path.suffix == ".mcap":
             summary = make_reader(file).get_summary()
@@ -118,6 +118,7 @@ def chunk_ends(path: Path) -> list[tuple[int, int]]:
 
 
 def check(path: Path, outcome: Outcome, at: int, ends: list[tuple[int, int]]) -> None:
+    """Fail if a frame before the damage, at byte ``at``, is lost, or a loss is not reported."""
     assert outcome.code in {0, 3, 4}, outcome
     intact = max((count for end, count in ends if end <= at), default=0)
     stamps = {EPOCH + k * SECOND for k in range(intact)}

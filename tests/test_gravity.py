@@ -38,6 +38,7 @@ TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 
 
 def imu(stamp: int, acceleration: Any, frame_id: str = "imu", *, absent: bool = False) -> Any:
+    """Return an IMU message; ``absent`` marks the acceleration as not measured."""
     covariance = np.zeros(9)
     covariance[0] = -1.0 if absent else 0.0
     vector = make("geometry_msgs/msg/Vector3", *map(float, acceleration))
@@ -88,7 +89,7 @@ def test_imu_without_stamps_uses_log_times(tmp_path: Path) -> None:
 
 
 def test_missing_stamps_of_an_imu_are_in_the_clock_of_the_others(tmp_path: Path) -> None:
-    """A simulation begins at 0; at its beginning, there was no acceleration."""
+    """Simulated time begins at 0: with log times instead, its first frames had no up direction."""
     items = [
         ("/imu", EPOCH + stamp, imu(stamp, a, "camera"))
         for stamp, a in ((0, [0, -9.8, 0]), (7 * SECOND, [9.8, 0, 0]))
@@ -212,7 +213,7 @@ def test_topic_that_ends_early_does_not_hold_frames_back(
 
 
 def test_up_that_is_given_later_is_tested(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Transforms often begin after the first frames, which must not decide for the others."""
+    """Transforms often begin after the first frames: up must be tested when it first appears."""
     poses = PoseFinder(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
     given, plane = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0])
     monkeypatch.setattr(up_check, "find_up", lambda *_: plane)
@@ -229,7 +230,7 @@ def test_up_that_is_given_later_is_tested(monkeypatch: pytest.MonkeyPatch) -> No
 def test_transforms_of_optical_data_in_another_frame_are_corrected(
     tmp_path: Path, *, clouds: bool
 ) -> None:
-    """Gazebo names the frame of the link: a moving camera gave each object many tracks."""
+    """Gazebo gives images the frame id of the link: a moving camera gave objects many tracks."""
     poses = []
     for name, frame_id in (("right", OPTICAL), ("wrong", "camera_link")):
         items = list(stream(MAKE, 4, clouds=clouds))
@@ -254,7 +255,7 @@ def test_transforms_of_optical_data_in_another_frame_are_corrected(
 def test_map_with_z_forward_does_not_correct_transforms(
     monkeypatch: pytest.MonkeyPatch, pitch_deg: float, *, corrected: bool
 ) -> None:
-    """Visual SLAM names the first pose of its camera the map: tracks drifted as it moved."""
+    """In visual SLAM, the map is the camera's first pose; a wrong correction made tracks drift."""
     pitch = np.radians(pitch_deg)
     poses = PoseFinder(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
     planes = np.array([0.0, -np.cos(pitch), -np.sin(pitch)])
@@ -275,7 +276,7 @@ def test_map_with_z_forward_does_not_correct_transforms(
 def test_transforms_of_clouds_in_other_axes_are_corrected(
     turn: Any, how: str, tmp_path: Path
 ) -> None:
-    """Gazebo's clouds have x forward, also in an optical frame: positions in the map were wrong."""
+    """Gazebo's clouds have x forward, even in an optical frame: positions in the map were wrong."""
     items = list(stream(MAKE, 4, clouds=True))
     for k, (topic, time, message) in enumerate(items):
         if topic.endswith("points"):
@@ -293,7 +294,7 @@ def test_transforms_of_clouds_in_other_axes_are_corrected(
 
 
 def test_table_above_the_origin_of_a_cloud_does_not_contradict_up(tmp_path: Path) -> None:
-    """In the frame of a robot's base, its points look like a table that is seen from below."""
+    """In a robot's base frame, a table above the origin looks like one seen from below."""
     links = [("map", "base_link", Pose(np.eye(3), np.array([0.1, -1.2, -0.8])))]
     items: list[tuple[str, int, Any]] = [("/tf_static", EPOCH, MAKE.transforms(links, EPOCH))]
     for k, view in enumerate(views()):
@@ -316,7 +317,7 @@ def test_up_without_other_source_comes_from_planes(tmp_path: Path) -> None:
 
 
 def test_imu_up_is_rotated_into_sensor_of_transformed_cloud(tmp_path: Path) -> None:
-    """The cloud names the frame of the IMU; up is needed in that of the sensor behind it."""
+    """The cloud is in the frame of the IMU, but up is needed in that of the sensor it is from."""
     items = [("/imu", EPOCH, imu(EPOCH, [1.2, -3.1, 9.0], "base"))]
     turn = Rotation.from_euler("xyz", [-1.9, 0.2, 0.6]).as_matrix()
     seen = replace(
@@ -344,13 +345,13 @@ def test_imu_is_used_if_transforms_lack_the_sensor(tmp_path: Path) -> None:
 
 
 def in_frames(path: Path, *links: tuple[str, str]) -> Path:
-    """Write static transforms from parents to children, each turned once more."""
+    """Write a recording of static transforms between (parent, child) frames, each `TURN`."""
     poses = [(parent, child, Pose(TURN, np.zeros(3))) for parent, child in links]
     return write(path, [("/tf_static", EPOCH, MAKE.transforms(poses, EPOCH))])
 
 
 def test_frames_of_a_robot_may_have_its_name_in_front(tmp_path: Path) -> None:
-    """With several robots, r1/map is the map of one of them; each has its own up direction."""
+    """With several robots, r1/map is the map of one robot; each has its own up direction."""
     links = ("r1/map", "r1/camera"), ("r2/map", "r2/base"), ("r2/base", "r2/camera")
     with open_recording(in_frames(tmp_path / "a.mcap", *links)) as recording:
         poses = PoseFinder.of(recording, up="tf", fixed_frame=None)
@@ -365,7 +366,7 @@ def test_frames_of_a_robot_may_have_its_name_in_front(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("robot", ["r1", "r10"])
 def test_up_is_that_of_the_robot_of_the_sensor(tmp_path: Path, robot: str) -> None:
-    """In one tree of transforms; a robot's name may begin with that of another."""
+    """Robots may share a tree of transforms, and a name may begin with that of another robot."""
     links = [("hall", f"{name}/map") for name in ("r1", "r10")]
     links += [(f"{name}/map", f"{name}/camera") for name in ("r1", "r10")]
     with open_recording(in_frames(tmp_path / "a.mcap", *links)) as recording:
@@ -376,7 +377,7 @@ def test_up_is_that_of_the_robot_of_the_sensor(tmp_path: Path, robot: str) -> No
 
 
 def test_map_of_all_robots_comes_before_that_of_one(tmp_path: Path) -> None:
-    """Where robots share a map, each has the same up direction as the others."""
+    """Robots that share a map must all get its up direction."""
     links = ("map", "r1/map"), ("r1/map", "r1/camera")
     with open_recording(in_frames(tmp_path / "a.mcap", *links)) as recording:
         poses = PoseFinder.of(recording, up="tf", fixed_frame=None)
@@ -388,7 +389,7 @@ def test_map_of_all_robots_comes_before_that_of_one(tmp_path: Path) -> None:
 
 
 def test_wanted_fixed_frame_may_begin_with_a_slash(tmp_path: Path) -> None:
-    """ROS 1 wrote frame ids so, and the transforms are stored without it."""
+    """ROS 1 wrote frame ids with a slash; transforms are stored without it."""
     with open_recording(in_frames(tmp_path / "a.mcap", ("/map", "/camera"))) as recording:
         poses = PoseFinder.of(recording, up="tf", fixed_frame="/map")
 
@@ -415,7 +416,7 @@ def test_fixed_frame_is_chosen_for_all_sensors(tmp_path: Path) -> None:
 def test_map_that_is_known_too_late_is_not_the_fixed_frame(
     begins: int, chosen: str, period: int, tmp_path: Path
 ) -> None:
-    """Until someone sets a pose, there is only odometry: no frame had a pose before."""
+    """Until someone sets the initial pose, there is only odometry: earlier frames had no pose."""
     items = []
     for k in range(11):
         links = [("odom", "camera", IDENTITY)] + [("map", "odom", IDENTITY)] * (k >= begins)
@@ -588,7 +589,7 @@ def test_sensor_without_fixed_frame_is_reported_if_something_moves(
 
 
 def test_frame_with_objects_does_not_count_as_without_plane(tmp_path: Path) -> None:
-    """An assumed plane is in no table; the run would contradict its own warning."""
+    """The plane under objects may be assumed, and thus in no table: the count would be wrong."""
     for name, schema, frames, of_other in (
         ("frames", FRAMES, (0, 1, 2, 3, 4), (0, 1, 3)),
         ("planes", PLANES, (0, 3), (1,)),
@@ -614,7 +615,7 @@ def test_frame_with_objects_does_not_count_as_without_plane(tmp_path: Path) -> N
 def test_unknown_fixed_frame_is_an_error_that_lists_the_known_ones(
     tmp_path: Path, links: Any, listed: str
 ) -> None:
-    """A misspelled name would leave all objects without a track in the room."""
+    """A misspelled name would silently leave all objects without tracks in a fixed frame."""
     path = in_frames(tmp_path / "a.mcap", *links)
     with open_recording(path) as recording, pytest.raises(ConfigError) as error:
         PoseFinder.of(recording, up="auto", fixed_frame="/mpa")
@@ -624,7 +625,7 @@ def test_unknown_fixed_frame_is_an_error_that_lists_the_known_ones(
 
 @pytest.mark.parametrize("up", ["gravity", "0,-1", "0,0,0", "0,nan,1", "0,-1,0,"])
 def test_malformed_up_is_an_error(tmp_path: Path, up: str) -> None:
-    """Not a traceback after the recording was opened."""
+    """It ended in a traceback after the recording was opened."""
     with (
         open_recording(in_frames(tmp_path / "a.mcap", ("map", "camera"))) as recording,
         pytest.raises(ConfigError, match=f"--up {up}: expected auto, tf, imu, or a vector"),
@@ -633,7 +634,7 @@ def test_malformed_up_is_an_error(tmp_path: Path, up: str) -> None:
 
 
 def test_damaged_imu_message_is_skipped_and_reported(tmp_path: Path) -> None:
-    """One such message must not end the run, and another type on the topic is no IMU."""
+    """One such message must not end the run; other types on the topic are ignored."""
     kind = "sensor_msgs/msg/Imu"
     items = [
         ("/imu", EPOCH, imu(EPOCH, (0, -9.7, 0), "camera")),

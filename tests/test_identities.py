@@ -160,4 +160,4 @@ def test_memory_of_hota_grows_with_pairs_that_match() -> None:
         tracemalloc.stop()
 
     assert hota == pytest.approx(1)
-    assert peak < 8 * 8 * count**2  # the thresholds alone are 19
+    assert peak < 8 * 8 * count**2  # a table of all pairs has 8 bytes for each of 19 thresholds

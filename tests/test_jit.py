@@ -91,7 +91,7 @@ def test_folder_that_another_process_removes_is_no_error(
 def test_folder_that_another_process_has_just_made_is_used(
     stage: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It fell back to the user's cache, where everything was compiled again."""
+    """The process fell back to the user's cache, where everything was compiled again."""
     code_folder.cache_clear()
     folder = code_folder(stage)
     assert folder is not None
@@ -102,7 +102,7 @@ def test_folder_that_another_process_has_just_made_is_used(
 
 
 def test_process_with_older_sources_does_not_spoil_the_cache(stage: Path, run: Run) -> None:
-    """It may compile and save the code it started with after the files have changed."""
+    """A process may compile and save code that it loaded before the files were changed."""
     newer = CALLEE.replace("2 * x", "20 * x")
     update = f"__import__('pathlib').Path(__file__).write_text({newer!r})"  # before any compiling
     (stage / "callee.py").write_text(f"{CALLEE}\n{update}")
@@ -131,7 +131,7 @@ def test_cache_folder_is_writable_or_configured(
 
 @pytest.fixture
 def no_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """Make the user's cache unwritable; return the folder of temporary files, which is left."""
+    """Make the user's cache unwritable; return the temporary folder, the last resort."""
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
     temporary = tmp_path / "tmp"
     temporary.mkdir()
@@ -142,7 +142,7 @@ def no_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 def test_user_who_can_write_nowhere_uses_compiled_kernels(
     stage: Path, run: Run, no_home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A container run as any user compiled for a minute at each start."""
+    """A container run as an arbitrary user compiled for a minute at each start."""
     assert run() == "7 0"
     assert not [*no_home.iterdir()], "nothing was needed there"
     for folder, *_ in os.walk(stage / "__pycache__", topdown=False):
@@ -167,7 +167,7 @@ def test_kernels_are_cached_for_the_next_start_without_home(stage: Path, run: Ru
 
 
 def test_machine_code_of_others_is_not_loaded(stage: Path, run: Run, no_home: Path) -> None:
-    """Any user can make a folder of this name, and put code into it."""
+    """Any user can make another user's folder in /tmp first, and put code into it."""
     stage.joinpath("__pycache__").write_text("")
     (no_home / f"shapecat-{os.getuid()}").mkdir()
     (no_home / f"shapecat-{os.getuid()}").chmod(0o777)
@@ -186,7 +186,7 @@ def test_kernel_is_compiled_without_any_cache_folder(stage: Path, run: Run, no_h
 def test_user_without_home_can_cache_kernels_elsewhere(
     stage: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
-    """Containers run with users that have neither HOME nor an entry in the list of users."""
+    """Containers may run as a user without HOME or an entry in /etc/passwd."""
 
     def fail() -> Path:
         msg = "Could not determine home directory."

@@ -38,7 +38,7 @@ CUP, CAN, BOWL = (0.11, -0.42, 0.83), (0.34, -0.15, 0.79), (-0.27, 0.08, 0.86)
 
 
 def test_only_mutually_nearest_objects_are_paired() -> None:
-    """Of two cups near the old place, the nearer one is paired; none beyond the limit is."""
+    """Of two cups near the old place, only the nearer is paired, and only within the limit."""
     one = np.array([[0.00, 0.5, 0.3], [0.05, 0.5, 0.3], [0.9, 0.1, 0.2]])
     other = np.array([[0.92, 0.1, 0.2], [0.04, 0.5, 0.3]])
     limit = np.array([[0.1, 0.1], [0.1, 0.1], [0.019, 0.1]])
@@ -191,7 +191,7 @@ def test_mixed_tables_are_refused(tmp_path: Path) -> None:
 
 
 def test_table_without_run_column_is_checked_by_positions(tmp_path: Path) -> None:
-    """If a user deletes the column, the positions decide; a hand-made table has none."""
+    """If a user deletes the column, the positions decide; a table without them is accepted."""
     mine = make_run(tmp_path / "mine", {1: static(CUP)})
     theirs = make_run(tmp_path / "theirs", {1: static(shifted(CUP, y=0.01))})
     for run, label in ((mine, "bowl"), (theirs, "can")):
@@ -278,7 +278,7 @@ def test_objects_that_swap_places_are_distinguished_by_time(tmp_path: Path) -> N
 def test_large_objects_are_matched_farther_at_once(
     tmp_path: Path, size: float, other: float, *, matched: bool
 ) -> None:
-    """Other settings see another part of a box; half of the mean width is within it."""
+    """Other settings see another part of a box: up to half of the mean width is allowed."""
     source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"}, size=size)
     target = make_run(tmp_path / "target", {5: static(shifted(CUP, y=0.07))}, size=other)
 
@@ -310,7 +310,7 @@ def test_frames_with_equal_stamps_are_told_apart(tmp_path: Path) -> None:
 
 
 def test_tracks_of_two_cameras_are_told_apart(tmp_path: Path) -> None:
-    """They may start at the same moment: half of the objects would be in no frame."""
+    """Frames of both may have equal numbers and stamps: one camera's objects would be lost."""
     objects = {1: static(CUP), 2: static(CAN), 3: static(shifted(CUP, x=0.4))}
     labels = {1: "mug", 2: "tin", 3: "bowl"}
     source = make_run(tmp_path / "source", objects, labels=labels, right={2})
@@ -323,7 +323,7 @@ def test_tracks_of_two_cameras_are_told_apart(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kept", [slice(0), slice(0, None, 2)])
 def test_detections_of_another_run_are_refused(tmp_path: Path, kept: slice) -> None:
-    """A frame that is missing was a KeyError, and a detection an IndexError."""
+    """A missing frame raised a KeyError, and a missing detection an IndexError."""
     objects = {1: static((0, 0, 1)), 2: static((1, 0, 1))}
     source = make_run(tmp_path / "a", objects, labels={1: "bowl"})
     target = make_run(tmp_path / "b", objects)
@@ -336,7 +336,7 @@ def test_detections_of_another_run_are_refused(tmp_path: Path, kept: slice) -> N
 
 
 def test_run_without_objects_misses_each_label(tmp_path: Path) -> None:
-    """An error about fixed frames, which one recording does not need, would hide the reason."""
+    """An error about fixed frames, not needed for the same recording, would hide the reason."""
     labels = {1: "mug", 2: "merge with 1"}
     objects = {1: static(CUP), 2: static(CAN)}
     source = make_run(tmp_path / "source", objects, labels=labels, fixed_frame=None)
@@ -378,7 +378,7 @@ def test_conflicting_labels_are_reported_not_applied(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("digest", ["xxh3-128:one", "xxh3-128:two"])
 def test_merged_tracks_may_be_one_track_in_target(tmp_path: Path, digest: str) -> None:
-    """By position, one part could compete with the other."""
+    """Matched by position, the two parts could compete for the track."""
     objects = {1: static(CUP, frames=range(7)), 2: static(CUP, frames=range(7, 10))}
     labels = {1: "mug", 2: "merge with 1"}
     source = make_run(tmp_path / "source", objects, labels=labels)
@@ -391,7 +391,7 @@ def test_merged_tracks_may_be_one_track_in_target(tmp_path: Path, digest: str) -
 
 
 def test_missing_objects_are_reported(tmp_path: Path) -> None:
-    """So are merges whose partner is missing."""
+    """Merges with a missing object must be reported as well."""
     objects = {1: static(CUP), 2: static(CAN), 3: static(BOWL)}
     labels = {1: "mug", 2: "tin", 3: "merge with 2"}
     source = make_run(tmp_path / "source", objects, labels=labels)
@@ -437,9 +437,9 @@ def test_merged_track_may_be_split_in_target(tmp_path: Path, part_first: bool) -
 
 @pytest.mark.parametrize("numbers", [(8, 9), (9, 8)])
 def test_parts_stay_merged_if_whole_is_seen_at_both(tmp_path: Path, numbers: Any) -> None:
-    """If the target misses the whole in a frame, the track of its part is the nearest there.
+    """If the target misses the object in a frame, the track of a part of it is nearest there.
 
-    The label would be copied to both, and the merged object would be two.
+    The label would be copied to both tracks, which would be two objects again.
     """
     later, part = range(1, FRAMES_EACH), shifted(CUP, z=0.075)
     objects = {1: static(CUP), 2: static(part, frames=later)}
@@ -530,7 +530,7 @@ def test_misspelt_label_does_not_block_the_others(tmp_path: Path) -> None:
 
 
 def test_category_unknown_to_target_is_transferred_as_new(tmp_path: Path) -> None:
-    """Processed again with the model before *pan* was learned, all pans would lose their label."""
+    """In a run with a model that has not learned *pan*, all pans would lose their label."""
     source = make_run(
         tmp_path / "source", {1: static(CUP), 2: static(CAN)}, labels={1: "pan", 2: "mug"}
     )
@@ -627,7 +627,7 @@ def test_positions_of_large_objects_may_scatter_more(
 
 
 def test_two_candidates_are_reported_not_labelled(tmp_path: Path) -> None:
-    """Both are about equally near to the old place."""
+    """Both are about equally near the old place: the label could go to the wrong one."""
     source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"})
     around = {1: static(shifted(CUP, x=0.03)), 2: static(shifted(CUP, x=-0.035))}
     target = second(tmp_path / "target", around)
@@ -656,7 +656,7 @@ def test_identical_cups_that_swap_are_not_labelled(tmp_path: Path) -> None:
 def test_object_between_two_old_places_is_not_labelled(
     tmp_path: Path, apart: float, *, found: bool
 ) -> None:
-    """It may be either of them: that one is nearer by 5 mm is chance."""
+    """It may be either old object: a difference of 5 mm in distance is chance."""
     places = {1: static(CUP), 2: static(shifted(CUP, y=apart))}
     source = make_run(tmp_path / "source", places, labels={1: "mug", 2: "tin"})
     target = second(tmp_path / "target", {1: static(shifted(CUP, y=0.02))})
@@ -737,7 +737,7 @@ def test_table_alone_may_have_categories_of_target(tmp_path: Path) -> None:
 
 
 def test_labels_without_match_survive_later_runs(tmp_path: Path) -> None:
-    """Someone tries other settings, and goes back: the labels were in no file any more."""
+    """After trying other settings and returning to the old ones, the labels were in no file."""
     folder, job = tmp_path / "lab", Job(tmp_path / "lab.mcap", tmp_path / "lab")
     for label in ("teapot", "vase", ""):
         with staged(folder) as new:
@@ -753,7 +753,7 @@ def test_labels_without_match_survive_later_runs(tmp_path: Path) -> None:
 
 
 def test_labels_of_another_recording_wait_until_they_are_asked_for(tmp_path: Path) -> None:
-    """A recording of another day may have the same name: a bowl at the place of a deleted cup."""
+    """Another recording may have the same name: a bowl would be deleted for a cup once there."""
     old = make_run(tmp_path / "lab", {4: static(CUP)}, labels={4: "delete"})
     new = second(tmp_path / "new", {1: static(CUP)})
     run = read_run(new)
@@ -790,7 +790,7 @@ def test_unreadable_tables_of_another_version_cost_no_labels(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("fixed_frame", ["map", None])
 def test_labels_of_another_version_are_transferred(tmp_path: Path, fixed_frame: str | None) -> None:
-    """Its folder could not be replaced, and its labels reached no other run."""
+    """The folder of a run of another version could not be replaced, nor its labels transferred."""
     objects = {4: static(CUP), 5: static(BOWL)}
     old = make_run(tmp_path / "lab", objects, labels={4: "mug"}, fixed_frame=fixed_frame)
     description = json.loads((old / "run.json").read_text())
@@ -834,7 +834,7 @@ def test_table_is_kept_for_good_if_any_label_is_lost(
 def test_table_with_labels_on_invalid_lines_is_kept(
     tmp_path: Path, found: str, broken: str, lost: tuple[int, str]
 ) -> None:
-    """It counted as a table without labels, so that the new run replaced it silently."""
+    """Such a table counted as one without labels, so that the new run replaced it silently."""
     old = make_run(tmp_path / "lab", {4: static(CUP)}, labels={4: "mug"})
     table = (old / "tracks.csv").read_bytes().decode().replace(found, broken).encode("cp1252")
     (old / "tracks.csv").write_bytes(table)
@@ -951,7 +951,7 @@ def test_by_place_transfers_labels_of_another_run(
     assert done.exit_code == 0, done.stderr
     assert "1 of 1 labels transferred" in done.stdout
     assert "teapot" in annotated_classes(two)
-    # Without it, corrected labels could not be transferred once more.
+    # Without this list, corrected labels could not be transferred once more.
     assert [item["label"] for item in read_run(two)["corrections"]["transferred"]] == ["teapot"]
 
 
@@ -971,7 +971,7 @@ def test_table_alone_with_confidence_outside_0_to_1_is_refused(
 
 @pytest.mark.parametrize(("found", "place"), [("x,y,z", "u,v,w"), ("0.34,", ",")])
 def test_table_alone_without_positions_is_refused(tmp_path: Path, found: str, place: str) -> None:
-    """Its labels would go to whatever is nearest to nowhere."""
+    """Without a position, its labels could go to any object."""
     table = tmp_path / "table.csv"
     write_csv(table, {4: static(CUP), 5: static(CAN)}, "wfar", {4: "mug"})
     text = table.read_text()
@@ -986,7 +986,7 @@ def test_table_alone_without_positions_is_refused(tmp_path: Path, found: str, pl
 
 
 def test_table_with_misspelt_labels_only_reports_each(tmp_path: Path) -> None:
-    """They would be lost without a word."""
+    """Misspelt labels would be lost without a word."""
     source = make_run(tmp_path / "source", {1: static(CUP), 2: static(CAN)}, labels={2: "cupp"})
     target = make_run(tmp_path / "target", {5: static(CUP), 6: static(CAN)})
 

@@ -27,7 +27,7 @@ FRAMES = 6
 
 
 def table_with_glasses(seed: int) -> World:
-    """Place four wine glasses, unknown to the model, between one object of each category."""
+    """Place four wine glasses, unknown to the model, among one object of each category."""
     rng = np.random.default_rng(seed)
     table = make_table(rng)
     layout = Layout(rng, gap=0.03)
@@ -42,7 +42,7 @@ def table_with_glasses(seed: int) -> World:
 
 
 def track_objects(recording: Path, folder: Path) -> dict[int, tuple[int, str]]:
-    """Return for each track the label of the object with most of its points, and its category."""
+    """Return each track's true label and category, by most of its points; else ``delete``."""
     frames = json.loads(recording.with_suffix(".truth.json").read_text())
     names = {item["label"]: item["category"] for frame in frames for item in frame["objects"]}
     labels = np.load(recording.with_suffix(".labels.npz"))["labels"]
@@ -91,8 +91,8 @@ def command(shapecat: Run, *words: object) -> str:
 def test_new_category_is_learned_from_corrections(shapecat: Run, tmp_path: Path) -> None:
     """Two labels are wrong and one category is new; known categories must not suffer.
 
-    Views that were learned from are easy: a model that fits badly, or is too careful, misses the
-    glasses of other tables, or takes their cups for some.
+    Views that were learned from are easy. On other tables, a model that fits badly or is too
+    careful misses glasses, or takes cups for glasses.
     """
     recording, *others = (
         record(table_with_glasses(seed), tmp_path / f"{name}.mcap", seed=seed, sensor=KINECT)

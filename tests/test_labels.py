@@ -239,7 +239,7 @@ def test_tracks_of_two_sensors_merge_in_fixed_frame(run: Path) -> None:
 
 
 def test_all_problems_are_reported_at_once(run: Path) -> None:
-    """No label is adopted if there is a problem."""
+    """Users would fix one problem at a time. No label is adopted before all are fixed."""
     corrected = run.parent / "mine.csv"
     corrected.write_text(
         labelled(t4="botle", t2="merge with 9", t1="bowl") + "77,0,cup,0.5,bowl,/depth\n"
@@ -376,7 +376,7 @@ def test_notes_in_columns_without_a_name_are_kept(run: Path) -> None:
 
 @pytest.mark.parametrize("label", ["none", "new None", "DontCare", "NA", "new nan", "Null"])
 def test_names_that_mean_no_object_to_readers_are_refused(run: Path, label: str) -> None:
-    """KITTI readers ignore DontCare; class 0 of point labels is none; pandas reads no NA or nan."""
+    """KITTI readers ignore DontCare; class 0 of point labels is none; pandas drops NA and nan."""
     (run / "tracks.csv").write_text(labelled(t4=label))
 
     with pytest.raises(OutputError, match="is not a category"):
@@ -384,7 +384,7 @@ def test_names_that_mean_no_object_to_readers_are_refused(run: Path, label: str)
 
 
 def test_outdated_page_undoes_no_labels(run: Path) -> None:
-    """It holds the labels of all tracks as they were when it was made."""
+    """A report page holds all labels as they were when it was made; later labels must stay."""
     corrected = run.parent / "mine.csv"
     corrected.write_text(labelled(t4="bowl", t1="box"))
     adopt_labels(corrected, run)
@@ -410,7 +410,7 @@ def test_added_label_leaves_table_of_replaced_labels(run: Path) -> None:
 
 
 def test_page_table_in_place_of_own_table_clears_labels_later(run: Path) -> None:
-    """Its column of labels that were seen would keep a label that is cleared in a copy of it."""
+    """If its column label_seen stayed, a label cleared in a copy of the table would come back."""
     header, *lines = labelled(t4="mug").splitlines()
     own = run / "tracks.csv"
     own.write_text("\n".join([f"{header},label_seen", *(f"{line}," for line in lines)]))
@@ -460,7 +460,7 @@ def test_cleared_labels_are_reported_and_kept_in_copy(
 def test_labels_of_someone_else_are_not_silently_replaced(
     shapecat: Callable[..., Result], guessed_run: Path, tmp_path: Path
 ) -> None:
-    """The second of two people with copies of one table is told what the first one said."""
+    """Of two people with copies of one table, the second is told which labels were replaced."""
     folder = tmp_path / "table"
     shutil.copytree(guessed_run, folder)
     rows = sorted(read_track_table(folder / "tracks.csv").rows, key=lambda row: row.track)
@@ -490,7 +490,7 @@ def test_missing_lines_keep_their_label(run: Path) -> None:
 
 
 def edited_table(folder: Path, content: bytes, tracks: Sequence[int] = (4,)) -> Path:
-    """Write a table that a person saved, beside the original table of these unknown objects."""
+    """Write a table as a person saved it, beside the original table of ``tracks``, all unknown."""
     lines = [f"{track},unknown,0.5,\n" for track in tracks]
     original = "track,category,confidence,label\n" + "".join(lines)
     (folder / "tracks.original.csv").write_text(original)
@@ -567,7 +567,7 @@ def test_new_table_with_umlauts_opens_in_a_spreadsheet(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("label", ["चाकू", "น้ำ", "cafe\u0301"])
 def test_label_may_have_combining_letters(tmp_path: Path, label: str) -> None:
-    """Vowel signs of Indian and Thai scripts, and accents as macOS writes them."""
+    """Indian and Thai scripts have vowel signs; macOS writes accents as combining letters."""
     text = f"track,category,confidence,label\n4,unknown,0.5,{label}\n"
     path = edited_table(tmp_path, text.encode())
 
@@ -711,7 +711,7 @@ def test_deleted_track_is_not_shown(tmp_path: Path) -> None:
 
 
 def test_track_of_two_sensors_ends_after_its_latest_view() -> None:
-    """Otherwise its box would stay on one topic for ever."""
+    """Otherwise its box would stay on one topic forever."""
     frames = {("/a", 0): slice(0, 1), ("/a", 1): slice(1, 2), ("/b", 0): slice(2, 3)}
 
     assert _last_in(frames, np.array([7, 7, 7]), np.array([0, 3, 1])) == {("/a", 1): (7,)}
@@ -725,7 +725,7 @@ def test_track_does_not_end_where_clock_is_set_back() -> None:
 
 
 def replayed(path: Path) -> list[tuple[int, set[str]]]:
-    """Replay the scene of a recording; return the entities after each message, and its time."""
+    """Replay a recording's scene; return each message's time and the entities shown after it."""
     alive: dict[str, float] = {}
     shown = []
     for now, scene in read_ros(path, "/shapecat/scene"):
@@ -767,7 +767,7 @@ def test_no_stale_box_remains_after_corrections(guessed_run: Path, tmp_path: Pat
 def test_annotate_names_only_written_files(
     guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result]
 ) -> None:
-    """The run has no review, because of `--no-rrd`."""
+    """A run made with `--no-rrd` has no review: a user would look for it in vain."""
     folder = tmp_path / "table"
     shutil.copytree(guessed_run, folder)
     done = shapecat("annotate", folder)
@@ -814,7 +814,7 @@ def test_new_category_of_many_tracks_is_compared_with_no_name(
 
 
 def refusals(shapecat: Callable[..., Result], folder: Path, out: Path) -> dict[str, str]:
-    """Return the message of each command that needs the labels of a run, which must stay as is."""
+    """Return the error of each command that needs the labels of a run; no file may change."""
     before = {path: path.read_bytes() for path in folder.iterdir()}
     messages = {}
     for name, *options in (("annotate",), ("report",), ("export", "--format", "crops")):
@@ -831,7 +831,7 @@ def refusals(shapecat: Callable[..., Result], folder: Path, out: Path) -> dict[s
 def test_missing_table_of_a_run_can_be_restored(
     guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result], content: bytes | None
 ) -> None:
-    """The run's own table is beside it, but no message named it."""
+    """The original table is beside the missing one, but no message named it."""
     folder = tmp_path / "table"
     shutil.copytree(guessed_run, folder)
     (folder / "tracks.csv").unlink()

@@ -210,7 +210,7 @@ def test_uncertain_views_are_novel_without_unknown_examples() -> None:
 
 
 def test_shape_functions_are_normalized_and_scale_invariant() -> None:
-    """On a line, all triangles are flat."""
+    """On a line, all triangles are flat: their angles are 0 or 180 degrees."""
     rng = np.random.default_rng(0)
     line = np.outer(rng.uniform(size=500), [1.0, 2.0, 0.0]).astype(np.float32)
     functions = shape_functions(line, np.random.default_rng(1))
@@ -278,7 +278,7 @@ def test_temperature_is_recovered(temperature: float, seed: int) -> None:
 
 @pytest.mark.parametrize("objects", [1, 8, 98])
 def test_confidence_is_limited_by_number_of_held_out_objects(objects: int) -> None:
-    """If all are right, the most probable confidence is 1, also of wrong labels."""
+    """If all held-out views are right, the best fit is a confidence of 1, even in wrong labels."""
     logits = np.eye(3)[np.arange(30) % 3] * 6.0
     temperature = fit_temperature(logits, np.arange(30) % 3, objects)
 
@@ -386,7 +386,7 @@ def test_learning_stores_a_limited_number_of_views(
 
 @pytest.mark.parametrize("left", [[1, 1, 0], [1, 0], [2, 0, 0], [1, 2, 3, 0, 0]])
 def test_cyclic_trees_are_rejected(left: list[int]) -> None:
-    """So are branches that meet again, whose paths double with every level."""
+    """Branches that meet again are rejected, too: their paths double with every level."""
     zeros = np.zeros(len(left), int)
 
     with pytest.raises(ValueError, match="damaged"):
@@ -434,7 +434,7 @@ def test_unknown_shapes_do_not_affect_calibration(categorizer: Categorizer) -> N
 
 
 def test_unknown_shapes_do_not_raise_confidence(categorizer: Categorizer) -> None:
-    """If all views are right, it follows the number of objects; these say nothing about it."""
+    """If all views are right, it grows with the number of objects; unknown ones must not count."""
     mixed = blobs(4, 2, (*CATEGORIES, UNKNOWN))
     truth = encode(mixed.labels, categorizer.categories)
     right = categorizer.predict(mixed.descriptors).posteriors.argmax(axis=1) == truth
@@ -448,9 +448,9 @@ def test_unknown_shapes_do_not_raise_confidence(categorizer: Categorizer) -> Non
 def test_shift_of_new_categories_uses_correct_held_out_views(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Wrong views cannot be lost, and the views of the fit would be too optimistic.
+    """Views that are already wrong cannot be lost, and those of the fit are too optimistic.
 
-    Of fits on few views, it would be that of a worse classifier than the final one.
+    Each fit leaves out only one part: on fewer views, the classifier would be a worse one.
     """
     count = 200
     rows = np.arange(count, dtype=np.float64)[:, None]
@@ -500,7 +500,7 @@ def test_classifier_of_new_category_matches_scikit_learn(l2: float) -> None:
 def test_shift_raises_only_odds_of_new_categories(
     categorizer: Categorizer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without it, a category that was learned from few views is seldom predicted."""
+    """Without the shift, a category that was learned from few views is seldom predicted."""
     new = blobs(30, 7, ("cone", "spoon"))
     x = blobs(50, 8, (*CATEGORIES, "cone", "spoon")).descriptors
     log_odds = []

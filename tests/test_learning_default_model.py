@@ -197,7 +197,7 @@ def test_training_uses_only_given_kinds_of_distractors(
 def test_clear_views_are_whole_and_well_segmented(
     change: dict[str, Any], partial: bool, clear: bool
 ) -> None:
-    """The figures of the card, and the rejection of parts, are those of these views."""
+    """The card's figures are of clear views; partial views set the threshold for rejection."""
     about = {"resting_pose": "lying", "source": "detected", "visible": 0.71, "overlap": 0.76}
     described = DescribedViews(
         np.zeros((1, 2), np.float32), np.array(["cup"]), np.array(["a"]), np.array([90]), np.ones(1)
@@ -210,7 +210,7 @@ def test_clear_views_are_whole_and_well_segmented(
 
 
 def test_test_set_shares_no_distractors_with_the_other_sets() -> None:
-    """A model that has trained on the unknown shapes of its test would seem to know them."""
+    """A model trained on the unknown shapes of the test would seem too good at rejecting them."""
     sets = {name: options_of(name) for name in ("training", "calibration", "test")}
     training, calibration, test = (set(options.kinds) for options in sets.values())
 

@@ -88,7 +88,7 @@ def test_model_file_is_reproducible(saved: Path, tmp_path: Path) -> None:
 def test_too_large_models_replace_nothing(
     saved: Path, monkeypatch: pytest.MonkeyPatch, limit: str
 ) -> None:
-    """Nothing could read them."""
+    """A model that the reader refuses for its size would replace one that works."""
     before = saved.read_bytes()
     monkeypatch.setattr(model_file, limit, 1000)
 
@@ -238,7 +238,7 @@ def test_zip_bomb_is_not_unpacked(saved: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_damaged_file_raises_or_still_predicts(saved: Path) -> None:
-    """Bytes are changed all over the file."""
+    """Damage anywhere in the file must not crash the reader, or the prediction later."""
     content = saved.read_bytes()
     rng = np.random.default_rng(0)
     x = np.zeros((1, 3), np.float32)

@@ -101,7 +101,7 @@ def occluded(folder: Path, tmp_path: Path) -> Path:
 def test_sampled_views_keep_their_own_weights(
     occluded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With those of other views, an occluder at the start would spoil the box of a whole track."""
+    """With weights of other views, an occluder at the start would spoil a whole track's box."""
     weights = list[F8]()
 
     def fuse_and_note(views: BoxViews, of_views: F8, *others: Any) -> FusedBox:

@@ -75,7 +75,7 @@ def lookup_at(window: TransformWindow, second: float) -> Any:
 def test_windowed_transforms_equal_those_of_full_read(
     tmp_path: Path, write: Callable[[Path], Path]
 ) -> None:
-    """Even if other messages of the file are read in between, as frames are."""
+    """Frames are read from the same file in between, which must not disturb the transforms."""
     with open_recording(write(tmp_path)) as recording:
         whole = TransformWindow(read_transforms(recording))
         window = TransformWindow.of(recording)
@@ -116,7 +116,7 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 def test_first_frame_reads_only_seconds_of_transforms(
     tmp_path: Path, decoded: Counter[str]
 ) -> None:
-    """Even if the frames begin in the middle, as with --start."""
+    """Reading all transforms would delay the first frame, also with --start."""
     around = AROUND_NS // SECOND
     with open_recording(in_mcap(tmp_path)) as recording:
         window = TransformWindow.of(recording)
@@ -179,7 +179,7 @@ def frame(second: int) -> Frame:
 def test_imu_is_read_only_as_far_as_frames_need(
     tmp_path: Path, decoded: Counter[str], first: int
 ) -> None:
-    """It may be switched on late; at 400 Hz, hours of it would delay the first frame."""
+    """The IMU may be switched on late; at 400 Hz, hours of it would delay the first frame."""
     ups = {k: (np.sin(0.1 * k), -np.cos(0.1 * k), 0.0) for k in range(first, SECONDS)}
     items = [
         ("/imu", EPOCH + k * SECOND, imu(EPOCH + k * SECOND, up, "camera")) for k, up in ups.items()

@@ -21,7 +21,7 @@ def resident_bytes() -> int:
 
 
 def test_memory_does_not_grow_with_number_of_frames(tmp_path: Path) -> None:
-    """A depth image kept by mistake exceeds the limit; detections are too small, but counted."""
+    """A depth image kept per frame exceeds the limit; detections, which are small, are counted."""
     recording = record(tmp_path / "a.mcap", 260)
     resident: dict[int, int] = {}
     alive: dict[int, int] = {}

@@ -28,9 +28,10 @@ def write_run(
     cells: int = 1,
     empty: Container[int] = range(2, 130, 7),
 ) -> None:
-    """Write the frames of a camera that drives along x, whose frame has other ``axes`` (3, 3).
+    """Write the tables of a camera that drives along x, with an error ``axes`` (3, 3) in rotation.
 
-    The frames ``empty`` have no objects. There are ``cells`` equal rooms, each with such a camera.
+    Objects move along x at ``carried_m_s``; the frames ``empty`` have none. There are ``cells``
+    equal rooms, each with such a camera.
     """
     rows: dict[str, list[Any]] = {"topic": [], "center": [], "center_fixed": [], "frame": []}
     frames = range(130)
@@ -70,7 +71,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0])
 def test_poses_that_are_worse_than_none_are_reported(
     tmp_path: Path, speed_m_s: float, axes: F8, carried_m_s: float, *, warns: bool
 ) -> None:
-    """In a map with y up, the axes of a frame are not known to be wrong: tracks drift, or end."""
+    """In a map with y up, wrong axes of the sensor's frame go unnoticed: tracks drift, or end."""
     write_run(tmp_path, speed_m_s, axes, carried_m_s)
 
     warnings = list(explain_misplacement(tmp_path, "map"))

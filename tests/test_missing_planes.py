@@ -27,7 +27,7 @@ MAKE = MessageFactory(2)
 
 
 def walls(path: Path, depths_m: Iterable[Any]) -> Path:
-    """Record a wall facing the camera at these depths, or these images; 0 is invalid."""
+    """Record a wall facing the camera at each depth, or each image of depths; 0 is no depth."""
     items: list[tuple[str, int, Any]] = []
     for k, depth_m in enumerate(depths_m):
         stamp = EPOCH + k * SECOND // 10
@@ -44,7 +44,7 @@ def warnings_of(path: Path, out: Path, *, up: str = "auto", range_m: float = 2.0
 
 
 def test_warning_names_range_if_table_is_beyond_it(tmp_path: Path) -> None:
-    """Otherwise it would resemble an empty table, and users would change the up direction."""
+    """Otherwise users would look for the cause in the up direction."""
     path = record(tmp_path / "far.mcap", 3)
 
     (warning,) = warnings_of(path, tmp_path, range_m=0.3)
@@ -93,7 +93,7 @@ def test_warning_distinguishes_missing_depth_wrong_up_and_noise(tmp_path: Path) 
 
 
 def test_warning_says_that_a_single_object_lacks_its_table(tmp_path: Path) -> None:
-    """Its advice led from a missing --up to a wrong one, and back."""
+    """The advice led users from a missing --up to a wrong one, and back."""
     images = np.zeros((2, CAMERA.height, CAMERA.width), np.float32)
     images[:, 10:40, 20:50] = np.random.default_rng(1).uniform(0.8, 1.1, (2, 30, 30))
     cut_out = walls(tmp_path / "object.mcap", images)

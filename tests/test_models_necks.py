@@ -20,7 +20,10 @@ def disks(*circles: tuple[int, int, int]) -> Bool:
 
 
 def split(mask: Bool, *, step_at: int | None = None) -> tuple[I4, int]:
-    """Split a mask; ``step_at`` is a column with a depth discontinuity in rows 20 to 52."""
+    """Return the labels of a split mask, and their number.
+
+    ``step_at`` is a column with a depth discontinuity in rows 20 to 51.
+    """
     blank, links = np.zeros((0, 3, 0), np.float32), np.full(mask.shape, RIGHT | DOWN, np.uint8)
     if step_at is not None:
         links[20:52, step_at] = DOWN
@@ -60,7 +63,7 @@ def test_surface_without_a_neck_between_wide_parts_stays_whole(mask: Bool) -> No
 
 
 def test_depth_discontinuity_makes_a_neck() -> None:
-    """It narrows a surface as the border does."""
+    """A depth discontinuity narrows a surface as its border does."""
     mask = np.zeros((80, 120), np.bool_)
     mask[20:60, 20:100] = True
     labels, n = split(mask, step_at=55)

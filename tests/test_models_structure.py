@@ -70,7 +70,7 @@ def test_random_viewpoint_faces_the_objects_within_the_range_of_the_sensor() -> 
 
 
 def test_sides_of_a_tote_lean_outwards(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All sides lean by the same angle, meet at the corners and miss the content."""
+    """All sides lean by the same angle and meet at the corners; the bottom stays."""
     monkeypatch.setattr(physics, "_FALL_STEPS", 1)  # the content does not matter
     monkeypatch.setattr(physics, "_MAX_STEPS", 0)
     world = make_scene("bin", np.random.default_rng(2002), frames=1)
@@ -97,7 +97,7 @@ def test_sides_of_a_tote_lean_outwards(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_rack_has_posts_instead_of_sides() -> None:
-    """Posts extend above the highest shelf; the objects on the shelves stay."""
+    """Posts at the corners extend above the highest shelf; the floor and the shelves stay."""
     world = make_scene("shelf", np.random.default_rng(2004), frames=1)
     boards = [s for s in world.supports if s.name.startswith("board")]
     corner = np.abs(np.concatenate([board.mesh.vertices for board in boards])).max(axis=0)
@@ -129,7 +129,7 @@ def _armed(world: World, arms: str) -> Iterator[tuple[np.random.Generator, Pose,
 
 
 def test_arms_of_the_robot_begin_beside_its_camera() -> None:
-    """They end above the support, and hide something in most images."""
+    """They stay above the support, and are visible in most images."""
     world = make_scene("clutter", np.random.default_rng(2003), frames=1)
     table = max(support.height for support in world.supports if support.holds_objects)
     seen = 0

@@ -189,7 +189,7 @@ def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
 
 
 def test_boxes_of_two_cameras_stay_until_the_next_frame_of_their_own() -> None:
-    """With frames of both in turn, a box vanished wherever a camera dropped a frame."""
+    """Timed by the frames of both, a box vanished wherever its camera dropped a frame."""
     frames = [annotation_frame(t, s, 1) for s in (0, 10, 40, 50) for t in ("/a", "/b")]
     frames += [annotation_frame("/b", 50 + k, 1) for k in range(1, 200)]
     frames.append(annotation_frame("/a", 900, 1))
@@ -213,7 +213,7 @@ def test_boxes_stay_until_the_next_message(slow: int) -> None:
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "protobuf", "json"])
 def test_lifetime_does_not_span_jump_of_clock(encoding: str) -> None:
-    """From the time since start-up to that since 1970: the seconds of a ROS duration overflow."""
+    """If a clock jumps from time since start-up to time since 1970, a ROS duration overflows."""
     frames = [
         annotation_frame("/a", 12 * 10**9, 1),
         annotation_frame("/a", 1_700_000_000 * 10**9, 1),
@@ -452,7 +452,7 @@ def test_long_path_keeps_newest_positions() -> None:
 
 
 def test_path_of_ended_track_leaves_all_sensors() -> None:
-    """The sensor that saw it last tells its end; paths of others would stay for ever."""
+    """Only the sensor that saw a track last tells its end: other paths would stay forever."""
     drawn: list[Any] = []
     columns: Any = SimpleNamespace(
         add=lambda entity, *row, **_: drawn.append((entity, len(row[1])))
@@ -483,7 +483,7 @@ def test_path_of_ended_track_leaves_all_sensors() -> None:
 def test_annotations_use_encoding_of_their_topic(
     annotated: str | None, kind: str, expected: str
 ) -> None:
-    """Viewers of one encoding would see the sensor without its objects."""
+    """Viewers that read only one encoding would show the sensor without its objects."""
     encodings = {"/a": "json", "/b": "json", "/depth": "cdr", "/bytes": "flatbuffer"}
     topics = tuple(Topic(name, "t", encoding, 9) for name, encoding in encodings.items())
     recording: Any = SimpleNamespace(kind=kind, topics=topics)
@@ -509,7 +509,7 @@ def test_frames_are_thinned_per_topic() -> None:
 
 @pytest.mark.parametrize("per_track", [0, 9])
 def test_image_is_in_a_data_set_once(per_track: int) -> None:
-    """Colour images are often rarer than frames: the others have masks half a period off."""
+    """Frames may share a colour image: only the nearest frame has masks that fit it."""
     images = [("/c", 1), ("/c", 1), ("/e", 1), ("/c", 3), None]
     masks = [one and ImageMasks(one[0], one[1] * MS, 0, "c", 4, 3, {}, {}) for one in images]
     views = (labelled_frame(k, labelled_object(1, range(9 + k))) for k in range(len(images)))
@@ -559,7 +559,7 @@ def test_view_vector_has_direction_distance_size_and_shape() -> None:
 def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPatch) -> None:
     """A detector would learn that an image with only uncertain objects is empty.
 
-    Nor are those of another sensor, whose frames of the same numbers are not chosen.
+    Frames of another sensor are omitted, too, although chosen frames have the same numbers.
     """
     images = [
         None,
@@ -594,7 +594,7 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
 
 
 def test_images_of_a_run_named_like_a_topic_keep_their_names() -> None:
-    """Images of one would replace images of the other, under the labels of both."""
+    """Otherwise images of one run would replace those of the other, with the labels of both."""
     named = [("a", ["/left", "/x/y", "/x_y"]), ("a__left", ["/left"]), ("a", ["/left"])]
     runs: Any = [
         SimpleNamespace(name=name, info={"options": {"topics": topics}}) for name, topics in named
@@ -672,7 +672,7 @@ def test_export_of_another_recording_is_not_replaced(tmp_path: Path) -> None:
 
 
 def test_data_set_with_other_recordings_is_not_replaced(tmp_path: Path) -> None:
-    """Crops are added to a data set; those who expect it of images too would lose the first."""
+    """Crops are added to a data set; users who expect this of images would lose the first ones."""
     monday, tuesday, both = (
         {"format": "coco", "recordings": list(names)} for names in ("a", "b", "ab")
     )
@@ -687,7 +687,7 @@ def test_data_set_with_other_recordings_is_not_replaced(tmp_path: Path) -> None:
 def test_data_set_of_several_recordings_is_not_replaced_by_one_of_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever exports a corrected run again, without the others, would lose these."""
+    """Exporting only a corrected run again would delete the images of the other runs."""
 
     def read(folder: Path) -> Any:
         name, info = folder.name, {"counts": {"frames": 1}, "input": {"digest": f"d-{folder.name}"}}
@@ -757,7 +757,7 @@ def test_marks_of_others_are_not_taken_for_exports(tmp_path: Path, wrong: Any) -
 
 
 def test_file_moved_into_export_is_not_deleted_with_it(tmp_path: Path) -> None:
-    """It keeps its time, which may be before that of the export."""
+    """A moved file keeps its time of change, which may be before the export."""
     out, mine = tmp_path / "out", tmp_path / "mine.png"
     mine.write_bytes(b"mine")
     os.utime(mine, ns=(0, 0))
@@ -886,7 +886,7 @@ def test_point_labels_have_class_and_instance_of_each_point(tmp_path: Path) -> N
 
 
 def test_tracks_beyond_16_bits_are_refused(tmp_path: Path) -> None:
-    """Their numbers would run into the classes of other points."""
+    """Cut to 16 bits, their numbers would be those of other tracks."""
     run: Any = SimpleNamespace(folder=tmp_path, labels={65536: TrackLabel(65536, "cup", 1.0)})
     with pytest.raises(OutputError, match="65535"):
         write_point_labels(tmp_path, [], run)
@@ -917,7 +917,7 @@ def test_point_label_legends_have_right_colours(tmp_path: Path) -> None:
 
 
 def test_crop_height_starts_at_its_support() -> None:
-    """It uses the height above the support if known, else half of the box."""
+    """The height above the support is used if known, else half of the height of the box."""
     item = labelled_object(1, [0, 2], height_m=0.31)
     middle = float(UP @ item.box.center)
     assert support_offset(item, UP) == pytest.approx(middle - 0.31)
@@ -944,7 +944,7 @@ def row(**changes: Any) -> dict[str, Any]:
 
 
 def test_support_height_is_relative_to_plane() -> None:
-    """Its height is that of the centre above the plane minus that above the support."""
+    """A support is as high as the centre is above the plane, minus its height above the support."""
     normal = np.array([0.6, 0.0, 0.8])
     plane = Plane(normal, 0.4, np.zeros((3, 3)), 0.5, 0.7)
     high = 0.6 * 0.3 + 0.8 * 1.1 - 0.4
@@ -982,7 +982,7 @@ def test_scene_node_text_has_track_size_and_flags() -> None:
 def test_scene_shows_merged_objects_once_and_no_deleted_ones(up: Any) -> None:
     """A mug found in three parts stands on a deleted plate, and a ball on the upper part.
 
-    Its first part was thought to stand on the can beside it.
+    The first part of the mug, its rim, was thought to stand on the can beside it.
     """
     up = np.array(up)
     plane = Plane(up, 0.0, np.zeros((3, 3)), 0.5, 0.7)
@@ -1077,7 +1077,7 @@ def test_slips_match_damerau_levenshtein_distance() -> None:
 
 @pytest.mark.parametrize("rows", [(0, 0), (0, 9), (3, 4), (0, 1), (8, 9)])
 def test_png_of_masks_reads_back(rows: tuple[int, int]) -> None:
-    """Level 1 encodes only runs of equal bytes, of which blank rows are one."""
+    """Level 1 encodes only runs of equal bytes, such as blank rows."""
     entries = np.zeros((9, 12), np.uint8)
     entries[slice(*rows)] = np.arange(12) % 5
     palette = np.arange(15, dtype=np.uint8).reshape(5, 3)
@@ -1194,7 +1194,7 @@ def test_points_of_coloured_cloud_have_their_own_colours() -> None:
 
 
 def test_report_does_not_draw_objects_on_another_recording() -> None:
-    """A smaller image in place of the recording has no such pixels."""
+    """If smaller images have replaced the recorded ones, pixels of objects are outside."""
     depth = np.ones((4, 6), np.float32)
     frame = Frame("/depth", 7, 5, 6, "cam", depth, Camera(6, 4, 5, 5, 3, 2))
     inside, outside = labelled_object(1, [3, 23]), labelled_object(2, [3, 24])

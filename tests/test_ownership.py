@@ -23,7 +23,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_folder_not_made_by_shapecat_is_refused(
     shapecat: Run, recording: Path, tmp_path: Path, option: str, name: str
 ) -> None:
-    """Even with --overwrite, and even if it resembles a run."""
+    """A user's own folder must survive --overwrite, even if it resembles a run."""
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab" / name).write_text("{}")
     result = shapecat("process", recording, "--out", tmp_path, *OPTIONS, option)
@@ -52,7 +52,7 @@ def test_overwrite_keeps_other_files_in_run_folder(
 
 def test_recording_damaged_after_its_run_is_noticed(shapecat: Run, tmp_path: Path) -> None:
     """The path alone, which is the same, would not say what differs."""
-    lab = record(tmp_path / "lab.bag", 12, container="ros1")  # not compressed: depth, not chunks
+    lab = record(tmp_path / "lab.bag", 12, container="ros1")  # uncompressed: only depth is damaged
     content = bytearray(lab.read_bytes())
     command = ("process", lab, "--out", tmp_path / "out", *OPTIONS)
     assert shapecat(*command).exit_code == 0
@@ -97,7 +97,7 @@ def test_new_file_beside_parts_of_bag_is_no_change(shapecat: Run, tmp_path: Path
 
 
 def test_each_failure_is_printed_once(shapecat: Run, recording: Path, tmp_path: Path) -> None:
-    """On stderr when it happens, and not again in the closing table."""
+    """Failures appear on stderr when they happen; the closing table must not repeat them."""
     (tmp_path / "lab.mcap").write_bytes(recording.read_bytes())
     for k in range(3):
         (tmp_path / f"bad{k}.mcap").write_text("no recording")

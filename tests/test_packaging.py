@@ -141,7 +141,7 @@ def test_wheel_simulates_and_processes_a_recording(bare: Path, tmp_path: Path) -
 
 
 def test_lock_file_covers_every_dependency() -> None:
-    """`make setup` installs only the lock file."""
+    """`make setup` installs only what the lock file lists."""
     locked = set(
         re.findall(r"^([a-z0-9-]+)==", (ROOT / "requirements.lock").read_text(), re.MULTILINE)
     )
@@ -152,7 +152,7 @@ def test_lock_file_covers_every_dependency() -> None:
 
 
 def test_only_versions_of_arrow_that_work_are_allowed() -> None:
-    """Up to version 25, types are converted by pandas, which `process` does without: it failed."""
+    """Up to version 25, Arrow converts types with pandas, which `process` lacks: it failed."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     (least,) = (n for n in project["dependencies"] if n.startswith("pyarrow>="))
     assert int(least.removeprefix("pyarrow>=").partition(".")[0]) >= 26

@@ -124,7 +124,7 @@ def final_labels(folder: Path) -> dict[int, str]:
 def test_objects_without_surface_are_unknown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of too few points nothing is described: a category would be that of an empty description."""
+    """Too few points have no descriptor: a category would be guessed from an empty one."""
 
     class CertainGuesser(Guesser):
         def predict(self, descriptors: Any) -> Any:
@@ -307,7 +307,7 @@ def test_review_is_told_which_scenes_need_a_place(
 def test_damage_found_while_recording_is_rewritten_is_reported(
     guessed_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If annotated.mcap is added to a finished run, only then are all messages read."""
+    """All messages are read only when annotated.mcap is added to the finished run."""
     folder = shutil.copytree(guessed_run, tmp_path / "table")
     run = read_run(folder)
     del run["seconds"]["annotated.mcap"]
@@ -430,7 +430,7 @@ def test_real_clouds_give_same_objects_as_depth_images(
     tmp_path: Path,
     name: str,
 ) -> None:
-    """Centres agree within 2 mm, and categories, in every container."""
+    """Centres agree within 2 mm, and categories are equal, in every container."""
     have = detections(shapecat, real_data / "osd_learn" / name, tmp_path)
 
     assert have
@@ -444,7 +444,7 @@ def test_real_clouds_give_same_objects_as_depth_images(
 def test_process_that_perceives_frames_has_model_and_settings_of_the_run(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It reads the model file again, which may have been replaced since the run began."""
+    """The process reads the model file again, which may have been replaced since the run began."""
     models: dict[Path | None, Any] = {
         Path(f"{name}.npz"): SimpleNamespace(model_id=name) for name in ("one", "two")
     }
@@ -462,7 +462,7 @@ def test_process_that_perceives_frames_has_model_and_settings_of_the_run(
 def test_output_added_later_leaves_others_to_be_annotated(
     shapecat: Run, guessed_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A run that forgot its annotated.mcap would keep the labels from before a correction there."""
+    """A run that forgot its annotated.mcap would leave the old labels there after a correction."""
     monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: Guesser())
     folder = shutil.copytree(guessed_run, tmp_path / "table")
     source = read_run(folder)["input"]["path"]

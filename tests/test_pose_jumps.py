@@ -22,7 +22,7 @@ SCENE = Scene(np.array([0, 0, 1], np.float32), (), ())
 
 
 def turned(yaws: F8) -> F8:
-    """Return cameras (n, 3, 3) that look horizontally, turned about the vertical."""
+    """Return rotations (n, 3, 3) of a camera that looks horizontally, for ``yaws`` in radians."""
     c, s, o = np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)
     return np.stack([np.stack(row, 1) for row in ((s, o, c), (-c, o, s), (o, o - 1, o))], 1)
 
@@ -30,9 +30,10 @@ def turned(yaws: F8) -> F8:
 def write_frames(
     folder: Path, places: F8, yaws: F8, numbers: I4, rate_hz: float, *, hand_s: int = 1
 ) -> None:
-    """Write the table of the frames of two topics; only the first topic has poses.
+    """Write the table of the frames of two topics; only the first topic has poses (sensor in map).
 
-    It has no pose where ``places`` is NaN. The second topic begins ``hand_s`` seconds later.
+    A pose is missing where ``places`` (n, 3) is NaN. Frame ``numbers`` (n,) at ``rate_hz`` give the
+    stamps. The second topic begins ``hand_s`` seconds later.
     """
     with PerceptionTables(folder, categories=("can",), model_id="m") as tables:
         for number, place, turn in zip(numbers, places, turned(yaws), strict=True):
@@ -103,7 +104,7 @@ def test_motion_during_a_gap_is_no_jump(tmp_path: Path) -> None:
 
 
 def test_run_of_a_corrected_map_has_the_warning(tmp_path: Path) -> None:
-    """The user reads it in run.json and on the terminal."""
+    """A warning that is not in run.json would be lost after processing."""
     shift = Pose(np.eye(3), np.array([0.4, -0.3, 0.0]))
     with CONTAINERS["mcap"].open(tmp_path / "a.mcap") as writer:
         for topic, time, message in stream(writer.messages, 10):
