@@ -763,7 +763,7 @@ def test_markdown_page_has_its_pictures_beside_it(trained: Path, tmp_path: Path)
 def test_command_writes_the_page(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str
 ) -> None:
-    """Its title names the data set, even if that is the current folder."""
+    """The title of the page names the data set, even if it is given as `.`."""
     dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
     monkeypatch.chdir(dataset if given == "." else tmp_path)
     page = tmp_path / "page.html"
@@ -851,7 +851,7 @@ def test_few_unknown_shapes_are_no_problem_for_cross_validation() -> None:
 
 @pytest.mark.usefixtures("few_trees")
 def test_baselines_may_have_their_own_training_set(trained: Path, tmp_path: Path) -> None:
-    """Its categories may be others, in another order, so posteriors have columns of their own."""
+    """A training set may have other categories, in another order: columns must match by name."""
     train = write_dataset(tmp_path / "train", ("ball", "box", "plate"), instances=3, seed=3)
     test = write_dataset(tmp_path / "test", ("box", "ball"), instances=2, seed=4)
     report = evaluate_folder(test, trained, baselines=train)
@@ -897,7 +897,7 @@ def test_accuracy_is_broken_down_by_sensor_pose(compared: Report) -> None:
 
 
 def test_only_views_of_one_object_are_fused() -> None:
-    """Leftover views must not be fused either; two of three views are wrong, but uncertain."""
+    """Views left over from groups of three must not be fused with those of another object."""
     truth = np.zeros(8, np.int64)
     posteriors = np.array([[0.9, 0.1], [0.45, 0.55], [0.45, 0.55]] * 2 + [[0, 1], [0, 1]], "f4")
     names = np.array(["a", "a", "a", "b", "b", "b", "c", "c"])

@@ -61,7 +61,7 @@ def test_any_kind_of_nan_is_read_without_a_warning(tmp_path: Path, encoding: str
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
 def test_fields_of_several_values_shift_later_fields(tmp_path: Path, encoding: str) -> None:
-    """Some files have normals or histograms before x."""
+    """If a file has normals before x, coordinates would be read from the wrong columns."""
     head = (
         "FIELDS normal x i y z\nSIZE 4 4 1 8 4\nTYPE F F U F F\nCOUNT 3 1 3 1 1\n"
         f"WIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA {encoding}\n"
@@ -229,7 +229,7 @@ def test_category_without_folders_of_objects_is_refused(tmp_path: Path, name: st
 
 
 def test_hidden_files_are_no_views(tmp_path: Path) -> None:
-    """Notebooks, macOS and trash folders leave some; the data set may be in a hidden folder."""
+    """Notebooks and macOS leave hidden files, but the data set itself may be in a hidden folder."""
     root = tmp_path / ".cache" / "data"
     for name in ("cup/a/0.pcd", "cup/a/._0.pcd", "cup/.ipynb_checkpoints/0.pcd", ".Trash/b/0.pcd"):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -310,7 +310,7 @@ def test_damaged_archives_raise_with_path(tmp_path: Path, kind: str) -> None:
 
 
 def test_viewpoint_far_away_counts_as_unknown(tmp_path: Path) -> None:
-    """Distances to it would be infinite."""
+    """Distances to such a viewpoint would be infinite."""
     points = np.random.default_rng(0).random((50, 3)).astype(np.float32)
     view = read_view(save(tmp_path, points, viewpoint=np.array([1e300, 0, 1])))
 

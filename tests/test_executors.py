@@ -77,7 +77,7 @@ def test_results_errors_and_deaths_reach_their_futures(executor: Executor) -> No
 
 
 def test_workers_do_not_load_pandas(executor: Executor) -> None:
-    """Arrow loads it with its first array, which takes half a second in each worker."""
+    """Arrow loads pandas with its first array, which takes half a second in each worker."""
     assert not executor.submit(loads_pandas).result()
 
 
@@ -406,7 +406,7 @@ def test_ray_keeps_no_result_of_a_finished_call(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_dask_logs_no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Dask's log of what it does hid the progress of the command."""
+    """Dask's own log hid the progress of the command."""
     distributed = pytest.importorskip("distributed")
 
     def fail(*_args: object, **_options: object) -> None:
@@ -523,7 +523,7 @@ def one_by_one() -> Iterator[tuple[int, float]]:
 
 
 def test_last_items_do_not_wait_for_slow_process(caplog: pytest.LogCaptureFixture) -> None:
-    """Items that were not sent yet are processed here, without a traceback on the terminal."""
+    """Items not yet sent are processed in this process, without a traceback on the terminal."""
     with OrderedPool(slow_elsewhere, 2) as pool:
         pool.start()
         wait_for(lambda: all(future.done() for future in pool._warming_up))

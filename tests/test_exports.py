@@ -76,7 +76,7 @@ def boxes(folder: Path, which: str = "_full") -> dict[int, list[tuple[int, np.nd
 
 
 def farthest(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the largest distance of a corner in ``a`` or ``b`` (8, 3) from the other box's."""
+    """Return the largest distance from a corner of one box (8, 3) to the nearest of the other."""
     distances = np.linalg.norm(a[:, None] - b[None], axis=-1)
     return float(max(distances.min(axis=0).max(), distances.min(axis=1).max()))
 
@@ -149,7 +149,7 @@ def test_exports_of_two_runs_do_not_collide(
 def test_run_given_by_several_paths_is_exported_once(
     run: Path, tmp_path: Path, shapecat: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was refused as another run with the same frames, or would be in the data set twice."""
+    """A run given twice was refused as another run with the same frames, or exported twice."""
     monkeypatch.chdir(run.parent)
     (tmp_path / "way").symlink_to(run)
     options = ("--format", "crops", "--every", 4)
@@ -406,7 +406,7 @@ def test_export_never_replaces_its_run(run: Path) -> None:
 
 
 def test_export_replaces_only_export_of_same_format(run: Path, tmp_path: Path) -> None:
-    """An export states its format and source, so that no other is replaced by mistake."""
+    """An export states its format and source, so that no other export is replaced by mistake."""
     folder = shutil.copytree(run, tmp_path / "table")
     info = read_run(folder)
     info["options"] |= {"start_s": 0.0, "end_s": 99.5}

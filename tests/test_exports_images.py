@@ -103,7 +103,7 @@ def test_coco_has_original_images_and_masks_of_tracks(run: Path, tmp_path: Path)
 
 
 def nearest(box: list[int], others: Iterable[tuple[int, int, int, int]]) -> int:
-    """Return how far the sides of a box (x, y, w, h) are from those of the most similar, pixels."""
+    """Return how far the sides of a box (x, y, w, h) are from those of the most similar, in px."""
     sides = np.add(box, [0, 0, *box[:2]])
     return min(int(np.abs(np.add(o, [0, 0, *o[:2]]) - sides).max()) for o in others)
 
@@ -169,7 +169,7 @@ def test_export_warns_about_missing_validation_and_labels(
 
 
 def test_yolo_polygons_cover_masks(run: Path, tmp_path: Path) -> None:
-    """Classes count from 0 and corners are shares of the image: both are easily mistaken."""
+    """Classes count from 0, and corners are fractions of the image: both are easy to get wrong."""
     export_dataset([read_finished(run)], "yolo", tmp_path / "yolo", ImageSelection())
     export_dataset([read_finished(run)], "coco", tmp_path / "coco", ImageSelection())
     data = read_coco(tmp_path / "coco")
@@ -358,7 +358,7 @@ def test_several_runs_make_one_data_set_split_by_recording(
 
 @pytest.mark.parametrize("format_", ["coco", "point-labels"])
 def test_progress_counts_frames_that_are_left_out(run: Path, tmp_path: Path, format_: str) -> None:
-    """Otherwise it ends far below its total, and promises a time that is several times too long."""
+    """Otherwise progress ends far below its total, and the time left is several times too long."""
     events: list[tuple[str, int, int | None]] = []
 
     def observe(*event: Any) -> None:

@@ -305,7 +305,7 @@ def test_kitti_2d_box_of_cloud_is_minus_one(tmp_path: Path) -> None:
 
 
 def test_kitti_keeps_cloud_of_level_lidar(tmp_path: Path) -> None:
-    """Treated as a camera that looks up, its points would be rotated onto their side."""
+    """Taken for a camera that looks up, a level lidar would have its cloud turned on its side."""
     points = np.array([[4.0, 1.0, -0.5], [2.0, -3.0, 0.25]], np.float32)
     level = replace(labelled(cut=False, hidden=False), up=np.array([0.0, 0.0, 1.0]), objects=())
     views: Any = [(level, Frame("/scan", 0, 5, 6, "laser", points=points), None)]

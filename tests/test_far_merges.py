@@ -25,7 +25,7 @@ Shapecat = Callable[..., Result]
 
 
 def surface(row: dict[str, Any]) -> Any:
-    """Return points 1/20 of a side apart on the full box of a row of tracks.parquet."""
+    """Return points (n, 3) on the full box of a row of tracks.parquet, 1/20 of its sides apart."""
     grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 21)] * 3), axis=-1).reshape(-1, 3)
     grid = grid[np.abs(grid).max(axis=1) == 0.5]
     turn = Rotation.from_quat(row["orientation_full"])

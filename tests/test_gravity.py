@@ -345,7 +345,7 @@ def test_imu_is_used_if_transforms_lack_the_sensor(tmp_path: Path) -> None:
 
 
 def in_frames(path: Path, *links: tuple[str, str]) -> Path:
-    """Write a recording of static transforms between (parent, child) frames, each `TURN`."""
+    """Write a recording of static transforms of (parent, child) frames, each turned by `TURN`."""
     poses = [(parent, child, Pose(TURN, np.zeros(3))) for parent, child in links]
     return write(path, [("/tf_static", EPOCH, MAKE.transforms(poses, EPOCH))])
 
@@ -493,7 +493,7 @@ def test_static_transforms_that_differ_are_reported(
 def test_transforms_with_the_stamps_of_others_are_reported(
     tmp_path: Path, back_s: float, moved_m: float, *, warned: bool
 ) -> None:
-    """A simulation was reset: poses of both sessions were mixed without a word."""
+    """After a simulation was reset, poses of both sessions were mixed without a word."""
     times = [(k * SECOND, 0.1 * k) for k in range(30)]
     again = 30 - back_s, 31 - back_s
     times += [(round(s * SECOND), 0.1 * s + moved_m) for s in again]
@@ -625,7 +625,7 @@ def test_unknown_fixed_frame_is_an_error_that_lists_the_known_ones(
 
 @pytest.mark.parametrize("up", ["gravity", "0,-1", "0,0,0", "0,nan,1", "0,-1,0,"])
 def test_malformed_up_is_an_error(tmp_path: Path, up: str) -> None:
-    """It ended in a traceback after the recording was opened."""
+    """A malformed --up ended in a traceback after the recording was opened."""
     with (
         open_recording(in_frames(tmp_path / "a.mcap", ("map", "camera"))) as recording,
         pytest.raises(ConfigError, match=f"--up {up}: expected auto, tf, imu, or a vector"),
@@ -634,7 +634,7 @@ def test_malformed_up_is_an_error(tmp_path: Path, up: str) -> None:
 
 
 def test_damaged_imu_message_is_skipped_and_reported(tmp_path: Path) -> None:
-    """One such message must not end the run; other types on the topic are ignored."""
+    """One damaged message must not end the run; other types on the topic are ignored."""
     kind = "sensor_msgs/msg/Imu"
     items = [
         ("/imu", EPOCH, imu(EPOCH, (0, -9.7, 0), "camera")),

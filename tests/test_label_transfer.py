@@ -191,7 +191,7 @@ def test_mixed_tables_are_refused(tmp_path: Path) -> None:
 
 
 def test_table_without_run_column_is_checked_by_positions(tmp_path: Path) -> None:
-    """If a user deletes the column, the positions decide; a table without them is accepted."""
+    """If a user deletes the column, positions decide; a table without positions is accepted."""
     mine = make_run(tmp_path / "mine", {1: static(CUP)})
     theirs = make_run(tmp_path / "theirs", {1: static(shifted(CUP, y=0.01))})
     for run, label in ((mine, "bowl"), (theirs, "can")):
@@ -247,7 +247,7 @@ def test_labels_are_transferred_to_tracks_at_same_positions(tmp_path: Path) -> N
 
 
 def test_runs_in_different_fixed_frames_are_not_compared(tmp_path: Path) -> None:
-    """A cup in one frame may be where a bowl is in the other, at every moment."""
+    """The position of a cup in one fixed frame may be that of a bowl in another."""
     source = make_run(
         tmp_path / "source", {1: static(CUP), 2: static(CAN)}, labels={1: "mug"}, fixed_frame="odom"
     )
@@ -259,7 +259,7 @@ def test_runs_in_different_fixed_frames_are_not_compared(tmp_path: Path) -> None
 
 
 def test_objects_that_swap_places_are_distinguished_by_time(tmp_path: Path) -> None:
-    """Two objects swap places halfway: their medians are the same, their times are not."""
+    """Two objects swap places halfway: only time, not their median positions, tells them apart."""
     half = FRAMES_EACH // 2
     first = [CUP] * half + [CAN] * half
     second = [CAN] * half + [CUP] * half
@@ -310,7 +310,7 @@ def test_frames_with_equal_stamps_are_told_apart(tmp_path: Path) -> None:
 
 
 def test_tracks_of_two_cameras_are_told_apart(tmp_path: Path) -> None:
-    """Frames of both may have equal numbers and stamps: one camera's objects would be lost."""
+    """Frames of two cameras may have equal numbers and stamps: objects of one would be lost."""
     objects = {1: static(CUP), 2: static(CAN), 3: static(shifted(CUP, x=0.4))}
     labels = {1: "mug", 2: "tin", 3: "bowl"}
     source = make_run(tmp_path / "source", objects, labels=labels, right={2})
@@ -420,7 +420,7 @@ def test_neighbour_does_not_get_label_of_missing_object(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("part_first", [False, True])
 def test_merged_track_may_be_split_in_target(tmp_path: Path, part_first: bool) -> None:
-    """Its tracks would be two objects again. The order of lines must not matter."""
+    """Otherwise its parts would be two objects again. The order of lines must not matter."""
     whole = [None if 5 <= k < 8 else CUP for k in range(FRAMES_EACH)]
     part = static(shifted(CUP, y=0.01), frames=range(5, 8))
     objects = {2: part, 1: whole} if part_first else {1: whole, 2: part}
@@ -627,7 +627,7 @@ def test_positions_of_large_objects_may_scatter_more(
 
 
 def test_two_candidates_are_reported_not_labelled(tmp_path: Path) -> None:
-    """Both are about equally near the old place: the label could go to the wrong one."""
+    """Of two objects about equally near the old place, the wrong one could get the label."""
     source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"})
     around = {1: static(shifted(CUP, x=0.03)), 2: static(shifted(CUP, x=-0.035))}
     target = second(tmp_path / "target", around)
@@ -676,7 +676,7 @@ def test_object_of_another_size_does_not_match(tmp_path: Path) -> None:
 
 
 def test_size_of_an_object_is_not_that_of_one_view(tmp_path: Path) -> None:
-    """In the first view it may be joined with its neighbour."""
+    """In the first view, an object may be joined with its neighbour."""
     source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"})
     target = second(tmp_path / "target", {1: static(CUP)}, first_size=(0.4, 0.1, 0.1))
 
@@ -696,7 +696,7 @@ def test_positions_in_other_frames_are_not_compared(tmp_path: Path, frame: str |
 
 @pytest.mark.parametrize("place", ["downloads", "other"])
 def test_table_alone_is_matched_by_positions(tmp_path: Path, place: str) -> None:
-    """It may lie beside the tables of another run, whose tracks are other objects."""
+    """Such a table may lie beside the tables of another run, whose tracks are other objects."""
     (tmp_path / "downloads").mkdir()
     make_run(tmp_path / "other", {4: static(CAN), 5: static(CUP)})
     table = tmp_path / place / "table.csv"
@@ -753,7 +753,7 @@ def test_labels_without_match_survive_later_runs(tmp_path: Path) -> None:
 
 
 def test_labels_of_another_recording_wait_until_they_are_asked_for(tmp_path: Path) -> None:
-    """Another recording may have the same name: a bowl would be deleted for a cup once there."""
+    """Another recording may have the same name: a bowl could be deleted where a cup was."""
     old = make_run(tmp_path / "lab", {4: static(CUP)}, labels={4: "delete"})
     new = second(tmp_path / "new", {1: static(CUP)})
     run = read_run(new)

@@ -97,7 +97,7 @@ def test_category_names_are_normalised(run: Path, label: str, meant: str) -> Non
 
 
 def test_damaged_table_of_shapecat_is_refused(run: Path) -> None:
-    """Confidences come from it: NaN ended in a traceback."""
+    """Confidences come from tracks.original.csv: a NaN there ended in a traceback."""
     (run / "tracks.original.csv").write_text(ORIGINAL.replace("0.500", "nan", 1))
 
     with pytest.raises(OutputError, match=r"tracks.original.csv, line \d: expected a track number"):
@@ -219,7 +219,7 @@ def test_tracks_of_different_topics_are_not_merged(run: Path) -> None:
 
 
 def test_tracks_with_common_sensor_are_merged(run: Path) -> None:
-    """Which of several sensors see an object changes while the robot moves."""
+    """The sensors that see an object change while the robot moves."""
     text = labelled(t4="merge with 1").replace("merge with 1,/depth", "merge with 1,/depth /other")
     write_table(run, text)
     assert read_labels(run / "tracks.csv")[4].track == 1
@@ -317,7 +317,7 @@ def test_error_lists_few_of_many_missing_tracks(run: Path, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("edited", ["cupp", "", "../../evil"])
 def test_edited_category_is_refused(run: Path, edited: str) -> None:
-    """It would become the name of a folder or of a class without any check."""
+    """An edited category would become the name of a folder or of a class without any check."""
     wrong = ORIGINAL.replace("2,0.000,can,", f"2,0.000,{edited},")
     for path in (run / "tracks.csv", run.parent / "mine.csv"):
         path.write_text(wrong)
@@ -529,7 +529,7 @@ def test_tables_saved_by_spreadsheets_are_read(tmp_path: Path, content: bytes) -
     ],
 )
 def test_label_in_unknown_encoding_is_refused(tmp_path: Path, label: str, encoding: str) -> None:
-    """It would become a category of other letters."""
+    """Read in another encoding, the label would become a category in other letters."""
     text = f"track,category,confidence,label\n4,unknown,0.5,{label}\n"
     path = edited_table(tmp_path, text.encode(encoding))
     with pytest.raises(OutputError, match=r"line 2: the label .* save the table as CSV UTF-8"):
@@ -577,7 +577,7 @@ def test_label_may_have_combining_letters(tmp_path: Path, label: str) -> None:
 
 @pytest.mark.parametrize("labels", [("new pan", "pan"), ("pan", "new pan")])
 def test_new_name_counts_for_all_lines(tmp_path: Path, labels: tuple[str, str]) -> None:
-    """*pan* is one letter from *can*, so that only *new* tells that it is meant."""
+    """*pan* is one letter from *can*, so only *new* tells that *pan* is meant."""
     lines = [f"{k},unknown,0.5,{label}\n" for k, label in enumerate(labels)]
     text = "track,category,confidence,label\n" + "".join(lines)
     path = edited_table(tmp_path, text.encode(), range(len(labels)))

@@ -140,7 +140,7 @@ def test_first_tree_makes_the_best_split(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_growing_trees_can_be_interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With many categories it takes minutes, after which a stopped command would write a model."""
+    """With many categories, growing takes minutes; a stopped command would still write a model."""
     monkeypatch.setattr(stopping, "_received", [])
     grown = []
 
@@ -278,7 +278,7 @@ def test_temperature_is_recovered(temperature: float, seed: int) -> None:
 
 @pytest.mark.parametrize("objects", [1, 8, 98])
 def test_confidence_is_limited_by_number_of_held_out_objects(objects: int) -> None:
-    """If all held-out views are right, the best fit is a confidence of 1, even in wrong labels."""
+    """If all held-out views are right, the best fit is a confidence of 1, even for wrong labels."""
     logits = np.eye(3)[np.arange(30) % 3] * 6.0
     temperature = fit_temperature(logits, np.arange(30) % 3, objects)
 
@@ -434,7 +434,7 @@ def test_unknown_shapes_do_not_affect_calibration(categorizer: Categorizer) -> N
 
 
 def test_unknown_shapes_do_not_raise_confidence(categorizer: Categorizer) -> None:
-    """If all views are right, it grows with the number of objects; unknown ones must not count."""
+    """If all views are right, confidence grows with the objects; unknown ones must not count."""
     mixed = blobs(4, 2, (*CATEGORIES, UNKNOWN))
     truth = encode(mixed.labels, categorizer.categories)
     right = categorizer.predict(mixed.descriptors).posteriors.argmax(axis=1) == truth

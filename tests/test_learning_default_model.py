@@ -70,7 +70,7 @@ def test_default_model_is_small_and_has_its_card() -> None:
 
 
 def test_model_card_matches_its_template(tmp_path: Path) -> None:
-    """A caveat that is only in the file is lost with the next training."""
+    """A caveat that is in the card but not in its template is lost with the next training."""
     card = (files("shapecat.models") / "MODEL_CARD.md").read_text("utf-8")
     report: Any = SimpleNamespace(categories=CATEGORIES, confusion=np.zeros((7, 7), int).tolist())
     write_card(tmp_path / "card.md", model=load_model().model_id, categories=CATEGORIES,
@@ -254,7 +254,7 @@ def half_ball() -> View:
 
 
 def test_fragments_are_parts_of_their_view() -> None:
-    """They have 30 to 85 % of its points and do not float above the support."""
+    """Fragments have 30 to 85 % of the points of a view and do not float above the support."""
     view = half_ball()
     for seed in range(20):
         fragment = cut_fragment(view, np.random.default_rng(seed))

@@ -226,7 +226,7 @@ def test_claimed_array_size_is_not_allocated(saved: Path) -> None:
 
 
 def test_zip_bomb_is_not_unpacked(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The limit is lowered, as packing more than it would take a second."""
+    """The test lowers the limit, since packing more than 128 MB would take a second."""
     assert model_file._LARGEST_PART == 128 << 20
     monkeypatch.setattr(model_file, "_LARGEST_PART", 8 << 20)
     content = bytes(9 << 20)

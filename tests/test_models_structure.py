@@ -129,7 +129,7 @@ def _armed(world: World, arms: str) -> Iterator[tuple[np.random.Generator, Pose,
 
 
 def test_arms_of_the_robot_begin_beside_its_camera() -> None:
-    """They stay above the support, and are visible in most images."""
+    """Arms stay above the support, and are visible in most images."""
     world = make_scene("clutter", np.random.default_rng(2003), frames=1)
     table = max(support.height for support in world.supports if support.holds_objects)
     seen = 0

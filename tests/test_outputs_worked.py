@@ -234,7 +234,7 @@ def patch_masks(
 
 
 def test_image_has_masks_of_the_frame_nearest_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Colour images are often rarer: the boxes were those of the first frame, half a period ago."""
+    """Several frames may share an image: its boxes were those of the first, half a period early."""
     stamps = [20, 40, 55, 90, 150, 160]
     masks = [
         (("/d", k), ImageMasks("/l", image, image + 60, "c", 40, 30, {}, {}))  # logged late
@@ -522,7 +522,7 @@ def test_image_is_in_a_data_set_once(per_track: int) -> None:
 
 
 def test_most_different_views_of_track_are_selected() -> None:
-    """The first has most pixels; each next one differs most from those chosen."""
+    """The first view has most pixels; each next view differs most from those already chosen."""
     columns = np.zeros((5, 8))
     columns[:, 0], columns[:, 4] = [0, 1.0, 5, 5.4, 9], [0.1, 0.3, 0.1, 0.1, 0.2]
     assert _different(columns, 3) == [1, 4, 2]
@@ -609,7 +609,7 @@ def test_images_of_a_run_named_like_a_topic_keep_their_names() -> None:
 
 @pytest.mark.parametrize(("pose", "most"), [(IDENTITY, 160), (None, 840)])
 def test_outlines_move_by_pixels_of_the_depth_camera(pose: Pose | None, most: int) -> None:
-    """At three times the resolution of the depth, 7 pixels are a small error, else a large one."""
+    """An error of 7 pixels is corrected only in images of three times the depth's resolution."""
     inside = np.zeros((110, 130), bool)
     inside[25:85, 35:95] = True
     pixels = np.where(inside[..., None], (128, 138, 148), (120, 130, 140)).astype(np.uint8)
@@ -650,7 +650,7 @@ def runs(count: int, same: int = 0) -> Any:
     [(1, 0.9, 0), (10, 0.2, 2), (10, 0.26, 3), (3, 0.99, 2), (5, 0, 0)],
 )
 def test_share_of_recordings_is_used_for_validation(count: int, val: float, expected: int) -> None:
-    """At least one is left for training; runs of one recording are never split."""
+    """At least one recording is left for training; runs of one recording stay together."""
     splits = split_runs(runs(count), val)
     assert splits.count("val") == expected
     assert split_runs(runs(count)[::-1], val) == splits[::-1]
@@ -790,7 +790,7 @@ def test_link_in_export_counts_by_its_own_time(tmp_path: Path) -> None:
 
 
 def test_export_excludes_files_of_interrupted_export(tmp_path: Path) -> None:
-    """Images of other options would have no labels, and be mistaken for background."""
+    """Left-over images would have no labels, and be mistaken for background."""
     out = tmp_path / "out"
 
     def interrupted(hidden: Path) -> int:
@@ -944,7 +944,7 @@ def row(**changes: Any) -> dict[str, Any]:
 
 
 def test_support_height_is_relative_to_plane() -> None:
-    """A support is as high as the centre is above the plane, minus its height above the support."""
+    """The support's height is the centre's height above the plane minus that above the support."""
     normal = np.array([0.6, 0.0, 0.8])
     plane = Plane(normal, 0.4, np.zeros((3, 3)), 0.5, 0.7)
     high = 0.6 * 0.3 + 0.8 * 1.1 - 0.4
@@ -1055,7 +1055,7 @@ def test_image_box_corners_enclose_its_pixels() -> None:
 
 
 def damerau(a: str, b: str) -> int:
-    """Count edits recursively, by trying all of them."""
+    """Return the Damerau-Levenshtein distance, by trying all edits recursively."""
     if not a or not b:
         return len(a) + len(b)
     counts = [
@@ -1194,7 +1194,7 @@ def test_points_of_coloured_cloud_have_their_own_colours() -> None:
 
 
 def test_report_does_not_draw_objects_on_another_recording() -> None:
-    """If smaller images have replaced the recorded ones, pixels of objects are outside."""
+    """If smaller images have replaced the recorded ones, pixels of objects lie outside them."""
     depth = np.ones((4, 6), np.float32)
     frame = Frame("/depth", 7, 5, 6, "cam", depth, Camera(6, 4, 5, 5, 3, 2))
     inside, outside = labelled_object(1, [3, 23]), labelled_object(2, [3, 24])

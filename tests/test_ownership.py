@@ -51,7 +51,7 @@ def test_overwrite_keeps_other_files_in_run_folder(
 
 
 def test_recording_damaged_after_its_run_is_noticed(shapecat: Run, tmp_path: Path) -> None:
-    """The path alone, which is the same, would not say what differs."""
+    """As the path is the same, the message must say that the content differs."""
     lab = record(tmp_path / "lab.bag", 12, container="ros1")  # uncompressed: only depth is damaged
     content = bytearray(lab.read_bytes())
     command = ("process", lab, "--out", tmp_path / "out", *OPTIONS)

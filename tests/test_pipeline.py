@@ -266,7 +266,7 @@ def test_unknown_topic_or_late_start_fails(shapecat: Run, tmp_path: Path, record
 
 
 def test_repeated_warning_is_stored_once(tmp_path: Path) -> None:
-    """Every command that writes outputs opens the recording again."""
+    """Every command that writes outputs opens the recording again, with the same warnings."""
     recording: Any = SimpleNamespace(warnings=["no index", "skipped 3"])
     run: Any = {
         "settings": {"outputs": {}},
@@ -369,7 +369,7 @@ def test_bad_recording_does_not_stop_the_others(
 def test_annotations_of_earlier_run_are_reported(
     shapecat: Run, guessed_run: Path, tmp_path: Path
 ) -> None:
-    """All messages are kept, so that viewers show the objects of both runs."""
+    """All messages are kept, so viewers show the objects of both runs."""
     result = shapecat("process", guessed_run / "annotated.mcap", "--out", tmp_path, "--no-rrd")
     first, second = (
         json.loads((folder / "run.json").read_text())["warnings"]

@@ -74,7 +74,7 @@ def test_correction_of_the_heading_is_reported(tmp_path: Path) -> None:
 
 
 def test_time_of_jump_counts_from_first_frame_of_run(tmp_path: Path) -> None:
-    """Users look there in the recording: poses may begin late, and another camera earlier."""
+    """Users look for this time in the recording: poses may begin late, another camera earlier."""
     places = driven(40, 5)
     places[:11], places[17] = np.nan, np.nan
     places[23:] += [0.5, 0.3, 0]
