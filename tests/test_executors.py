@@ -95,7 +95,7 @@ def test_replaced_workers_leave_nothing_open() -> None:
 
 
 def test_unpicklable_task_fails_alone() -> None:
-    """Its worker must take the next task, or a batch would wait forever."""
+    """The worker must take the next task, or a batch would wait forever."""
     one = LocalExecutor(1)
     assert one.submit(lambda: 1).exception() is not None
     assert [one.submit(abs, -k).result(20) for k in range(3)] == [0, 1, 2]

@@ -379,7 +379,7 @@ def test_point_labels_match_pixels_of_each_object(run: Path, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("format", ["kitti", "point-labels"])
 def test_frames_without_pose_are_left_out(run: Path, tmp_path: Path, format: str) -> None:  # noqa: A002  the word users know
-    """Their objects have no tracks; without labels, a model learns that they are background."""
+    """Objects in such frames have no tracks; a model would learn that they are background."""
     lost = shutil.copytree(run, tmp_path / "lost")
     table = pq.read_table(lost / "frames.parquet")
     for name in ("fixed_translation", "fixed_rotation"):

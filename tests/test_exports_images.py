@@ -52,7 +52,7 @@ def read_coco(out: Path, split: str = "train") -> dict[str, Any]:
 
 
 def decoded(segmentation: dict[str, Any]) -> np.ndarray:
-    """Read COCO's compressed run lengths, as its rleFrString describes them."""
+    """Return the mask (height, width) of run lengths, decoded as COCO's rleFrString does."""
     counts: list[int] = []
     letters = iter(segmentation["counts"])
     for letter in letters:

@@ -94,7 +94,7 @@ def test_kitti_line_matches_hand_calculation(tmp_path: Path) -> None:
 
 
 def test_kitti_distinguishes_truncated_from_occluded(tmp_path: Path) -> None:
-    """Truncated is cut by the image border; occluded is hidden by another object."""
+    """A truncated object is cut by the image border; an occluded one is hidden by another."""
     assert kitti(tmp_path, cut=False, hidden=True)[1:3] == (0.0, 1)
 
 

@@ -420,7 +420,7 @@ def test_neighbour_does_not_get_label_of_missing_object(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("part_first", [False, True])
 def test_merged_track_may_be_split_in_target(tmp_path: Path, part_first: bool) -> None:
-    """Otherwise its parts would be two objects again. The order of lines must not matter."""
+    """Otherwise the parts would be two objects again. The order of lines must not matter."""
     whole = [None if 5 <= k < 8 else CUP for k in range(FRAMES_EACH)]
     part = static(shifted(CUP, y=0.01), frames=range(5, 8))
     objects = {2: part, 1: whole} if part_first else {1: whole, 2: part}
@@ -639,7 +639,7 @@ def test_two_candidates_are_reported_not_labelled(tmp_path: Path) -> None:
 
 
 def test_identical_cups_that_swap_are_not_labelled(tmp_path: Path) -> None:
-    """In the second recording, each of them is nearly where the other was."""
+    """In the second recording, each cup is nearly where the other was."""
     labels = {1: "mug", 2: "tin"}
     beside = shifted(CUP, y=0.06)
     source = make_run(tmp_path / "source", {1: static(CUP), 2: static(beside)}, labels=labels)
@@ -656,7 +656,7 @@ def test_identical_cups_that_swap_are_not_labelled(tmp_path: Path) -> None:
 def test_object_between_two_old_places_is_not_labelled(
     tmp_path: Path, apart: float, *, found: bool
 ) -> None:
-    """It may be either old object: a difference of 5 mm in distance is chance."""
+    """The object may be either old one: a difference of 5 mm in distance is chance."""
     places = {1: static(CUP), 2: static(shifted(CUP, y=apart))}
     source = make_run(tmp_path / "source", places, labels={1: "mug", 2: "tin"})
     target = second(tmp_path / "target", {1: static(shifted(CUP, y=0.02))})
@@ -999,7 +999,7 @@ def test_table_with_misspelt_labels_only_reports_each(tmp_path: Path) -> None:
 
 
 def test_object_between_two_old_ones_is_that_of_neither(tmp_path: Path) -> None:
-    """In whatever order the tracks are, it must not get the label of the first."""
+    """Whatever the order of the tracks, the object must not get the label of the first."""
     places = {1: static(CUP), 2: static(shifted(CUP, x=0.03))}
     for order in ((1, 2), (2, 1)):
         name = f"source{order[0]}"

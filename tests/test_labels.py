@@ -167,7 +167,7 @@ def test_missing_original_table_is_named(run: Path) -> None:
 
 @pytest.mark.parametrize("own", [True, False])
 def test_labels_in_table_with_other_decimal_point_are_adopted(run: Path, *, own: bool) -> None:
-    """German spreadsheets save 0.500 as 500; nobody could apply labels of such a table."""
+    """German spreadsheets save 0.500 as 500; the labels of such a table could not be applied."""
     corrected = (run if own else run.parent) / "tracks.csv"
     corrected.write_text(labelled(t4="bowl").replace("0.", "").replace(",", ";"))
     adopt_labels(corrected, run)
@@ -711,7 +711,7 @@ def test_deleted_track_is_not_shown(tmp_path: Path) -> None:
 
 
 def test_track_of_two_sensors_ends_after_its_latest_view() -> None:
-    """Otherwise its box would stay on one topic forever."""
+    """Otherwise the box of the track would stay on one topic forever."""
     frames = {("/a", 0): slice(0, 1), ("/a", 1): slice(1, 2), ("/b", 0): slice(2, 3)}
 
     assert _last_in(frames, np.array([7, 7, 7]), np.array([0, 3, 1])) == {("/a", 1): (7,)}

@@ -421,7 +421,7 @@ def test_confidence_grows_with_objects_rather_than_views(categorizer: Categorize
 
 
 def test_unknown_shapes_do_not_affect_calibration(categorizer: Categorizer) -> None:
-    """Counted as known, they would loosen the threshold."""
+    """Counted as known, unknown views would loosen the threshold."""
     known = blobs(60, 2)
     mixed = blobs(60, 2, (*CATEGORIES, UNKNOWN))  # the same views, and 60 unknown ones
     assert np.array_equal(mixed.descriptors[: len(known.labels)], known.descriptors)

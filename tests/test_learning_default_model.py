@@ -223,7 +223,7 @@ def test_test_set_shares_no_distractors_with_the_other_sets() -> None:
 
 
 def test_thin_background_gives_unknown_views() -> None:
-    """Otherwise a model takes it for plates. Higher background may have the shape of a category."""
+    """A model took thin background for plates. Higher background may have a category's shape."""
     sizes = ((0.08, 0.06, 0.12), (0.1, 0.09, 0.022), (0.07, 0.06, 0.1))
     box, board, block = (rounded_box(size) for size in sizes)
     here, there = (Pose(np.eye(3), np.array([x, 0.05, 0.0])) for x in (-0.15, 0.15))

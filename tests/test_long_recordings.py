@@ -35,7 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def usual(folder: Path) -> tuple[pa.Table, str]:
-    """Return the tracks with the usual sizes of batches."""
+    """Return tracks.parquet and tracks.csv, written with the usual sizes of batches."""
     return tracked(folder)
 
 

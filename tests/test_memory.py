@@ -35,7 +35,7 @@ def test_memory_does_not_grow_with_number_of_frames(tmp_path: Path) -> None:
     process(Job(recording, tmp_path / "out", rrd=False), watch)
 
     assert resident[257] - resident[97] < 8 << 20
-    assert alive[257] < alive[97] + 400  # a segment that is not written yet has 200
+    assert alive[257] < alive[97] + 400  # a segment that is not written yet has 200 detections
 
 
 @pytest.mark.parametrize("chosen", [None, "mimalloc"])

@@ -265,7 +265,7 @@ def test_successive_images_with_equal_stamps_are_all_annotated(
 def test_image_of_two_sensors_is_annotated_once_if_one_is_late(
     late: int, every: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its boxes would flicker: those of one sensor, then of the other, in messages out of order.
+    """Boxes would flicker: those of one sensor, then of the other, in messages out of order.
 
     The late sensor is nearer in time and ends early. The other one may skip images.
     """
@@ -886,7 +886,7 @@ def test_point_labels_have_class_and_instance_of_each_point(tmp_path: Path) -> N
 
 
 def test_tracks_beyond_16_bits_are_refused(tmp_path: Path) -> None:
-    """Cut to 16 bits, their numbers would be those of other tracks."""
+    """Cut to 16 bits, their numbers would become the numbers of other tracks."""
     run: Any = SimpleNamespace(folder=tmp_path, labels={65536: TrackLabel(65536, "cup", 1.0)})
     with pytest.raises(OutputError, match="65535"):
         write_point_labels(tmp_path, [], run)
