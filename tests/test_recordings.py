@@ -1,4 +1,4 @@
-"""Tests of recording containers: messages are read, and damage is reported, never raised."""
+"""Tests of recording containers: messages are read, and damage is reported."""
 
 import gzip
 import os
@@ -47,7 +47,7 @@ def text(value: str) -> bytes:
 
 
 def write_mcap(path: Path, times: list[int], **options: Any) -> Path:
-    """Write a text message at each time, /a and /b in turn."""
+    """Write a text message at each log time (ns), on /a and /b in turn."""
     options = {"chunk_size": 200, "compression": CompressionType.NONE} | options
     with mcap_writer(path, **options) as writer:
         definition = STORE.generate_msgdef(STRING, ros_version=2)[0].encode()
@@ -68,9 +68,9 @@ def times_read(path: Path, **options: Any) -> list[int]:
 def test_messages_of_closed_recording_are_refused(
     tmp_path: Path, container: str, read: int
 ) -> None:
-    """Some readers ended as if there were no more messages, others raised what their library did.
+    """Some readers ended as if there were no more messages, others raised an error of a library.
 
-    Messages that are in memory when the recording is closed are refused as well.
+    Messages that are already in memory when the recording is closed are refused as well.
     """
     path = record(tmp_path / "a", 5, container=container)
     with open_recording(path) as recording:
@@ -128,7 +128,7 @@ def test_time_window_and_topics_are_selected(tmp_path: Path) -> None:
     ],
 )
 def test_mcap_without_index_is_read_in_file_order(tmp_path: Path, options: dict[str, Any]) -> None:
-    """The library would sort everything in memory, or raise a bare KeyError."""
+    """The mcap library would sort all messages in memory, or raise a bare KeyError."""
     times = [30, 10, 20, 0]
     path = write_mcap(tmp_path / "a.mcap", times, **options)
 
@@ -171,9 +171,9 @@ def test_warning_states_lost_bytes_of_unfinished_mcap(tmp_path: Path, rest: byte
 
 
 def test_chunk_without_messages_does_not_set_start(tmp_path: Path) -> None:
-    """By the format its times are 0, and the recording would begin in 1970.
+    """The times of an empty chunk are 0: the recording would begin in 1970, `--end 5` read nothing.
 
-    `--end 5` would then read nothing. Some writers begin with a chunk of schemas and channels.
+    Some writers begin with a chunk that holds only schemas and channels.
     """
     path = tmp_path / "a.mcap"
     with mcap_writer(path, compression=CompressionType.NONE) as writer:
@@ -205,7 +205,7 @@ def test_mcap_truncated_anywhere_gives_first_messages(tmp_path: Path) -> None:
 
 
 def test_flipped_bytes_in_mcap_raise_only_message_errors(tmp_path: Path) -> None:
-    """Wrong length fields must not cause allocations, endless loops or tracebacks."""
+    """Wrong length fields must not cause huge allocations, endless loops or tracebacks."""
     whole = write_mcap(tmp_path / "a.mcap", list(range(6)), compression=CompressionType.LZ4)
     data = whole.read_bytes()
     path = tmp_path / "flipped.mcap"
@@ -236,7 +236,7 @@ def test_chunk_is_read_only_up_to_last_wanted_message(
         for time in range(3, 6):
             writer.add_message(large, time, noise, time)
     data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0xFF  # in an image
+    data[len(data) // 2] ^= 0xFF  # in a message of /b
 
     assert times_read(path) == list(range(6))
     path.write_bytes(data)
@@ -286,7 +286,7 @@ def test_chunk_with_huge_claimed_size_is_skipped(tmp_path: Path, size: int) -> N
 
 
 def test_memory_does_not_grow_with_recording(tmp_path: Path) -> None:
-    """Only the chunks that overlap in time are held."""
+    """A recording may be larger than the memory; only chunks that overlap in time are held."""
     tracemalloc = pytest.importorskip("tracemalloc")
     path = tmp_path / "a.mcap"
     with mcap_writer(path, "", compression=CompressionType.NONE, chunk_size=1 << 20) as writer:
@@ -304,7 +304,7 @@ def test_memory_does_not_grow_with_recording(tmp_path: Path) -> None:
 
 
 def test_kept_small_message_does_not_keep_its_chunk(tmp_path: Path) -> None:
-    """Transforms are kept by the thousand, each from a chunk of megabytes."""
+    """Thousands of transforms are kept; each would keep its chunk of megabytes in memory."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, "") as writer:
         channel = writer.register_channel("/blob", "raw", 0)
@@ -345,7 +345,7 @@ def test_bag_with_two_types_on_one_topic_is_read(tmp_path: Path, compression: An
 
 
 def test_bag_truncated_anywhere_gives_first_messages(tmp_path: Path) -> None:
-    """Even without an index, as if the recorder was killed."""
+    """A killed recorder leaves a bag without an index; its messages must still be read."""
     whole = write_bag(tmp_path / "a.bag")
     data = whole.read_bytes()
     path = tmp_path / "cut.bag"
@@ -421,7 +421,7 @@ def test_ros2_folder_is_read(
 
 
 def test_messages_compressed_one_by_one_in_mcap_are_read(tmp_path: Path) -> None:
-    """``ros2 bag record -s mcap --compression-mode message`` writes what few tools can read."""
+    """``ros2 bag record -s mcap --compression-mode message`` compresses messages, not chunks."""
     pack = zstandard.ZstdCompressor().compress
     with mcap_writer(tmp_path / "a.mcap") as writer:
         schema = writer.register_schema(STRING, "ros2msg", b"string data")
@@ -442,9 +442,9 @@ def test_messages_compressed_one_by_one_in_mcap_are_read(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("start", [None, 30, 10])
 def test_damage_found_while_a_folder_is_read_is_reported(tmp_path: Path, start: int | None) -> None:
-    """The frames of a damaged part would be missing without a word.
+    """The frames of a damaged part would be missing without a warning.
 
-    The next part starts after it, or while it is still written.
+    The next part, if there is one, begins after the damaged part ends, or before.
     """
     path = tmp_path / "bag"
     path.mkdir()
@@ -463,16 +463,16 @@ def test_damage_found_while_a_folder_is_read_is_reported(tmp_path: Path, start: 
 
 
 def test_file_not_listed_in_metadata_is_not_read(tmp_path: Path) -> None:
-    """Guards against another recording, or a repaired copy of a part, beside the parts."""
+    """Another recording, or a repaired copy of a part, may lie beside the parts of a bag."""
     path = write_folder(tmp_path / "bag", StoragePlugin.MCAP)
     write_mcap(path / "another.mcap", [7, 8])
     plain = (path / "metadata.yaml").read_text()
 
-    for quote in ("", "'", '"'):  # YAML needs them around some names
+    for quote in ("", "'", '"'):  # YAML needs quotes around some names
         listed = plain.replace("- bag.mcap\n", f"- {quote}bag.mcap{quote}\n")
         (path / "metadata.yaml").write_text(listed)
         assert times_read(path) == [k * SECOND for k in range(5)]
-    with open_recording(path) as recording:  # or a take in the wrong folder would be missed
+    with open_recording(path) as recording:  # a recording in the wrong folder must be noticed
         skipped = "files that metadata.yaml does not name are not read: another.mcap"
         assert recording.warnings == [skipped]
     (path / "metadata.yaml").unlink()
@@ -484,7 +484,7 @@ def test_file_not_listed_in_metadata_is_not_read(tmp_path: Path) -> None:
     [("string", 5000, True), ("uint8", 5000, False), ("string", 9, False)],
 )
 def test_long_string_arrays_are_refused(kind: str, length: int, *, refused: bool) -> None:
-    """The library generates code per element; one line of definition could fill the memory."""
+    """Code is generated for each element: one line of a definition could exhaust memory."""
     name, definition = "lab/msg/Long", f"{kind}[{length}] data".encode()
     channel = Channel("/a", name, "cdr", name, "ros2msg", definition)
     expected = pytest.raises(ValueError, match=f"an array of {length} is too long")
@@ -519,7 +519,7 @@ def test_parts_unpacked_by_killed_process_are_removed(
 @pytest.mark.parametrize("before", [[], [3, 8]])
 @pytest.mark.parametrize("after", [[], [101, 107]])
 def test_overlapping_splits_are_merged(tmp_path: Path, before: list[int], after: list[int]) -> None:
-    """Also if other splits follow each other: frames would go back in time."""
+    """Read one after the other, splits that overlap would give frames that go back in time."""
     for k, times in enumerate((before, [10, 20, 40, 60], [30, 50, 70, 90], after)):
         if times:
             write_mcap(tmp_path / f"b_{k}.mcap", times)
@@ -528,7 +528,7 @@ def test_overlapping_splits_are_merged(tmp_path: Path, before: list[int], after:
 
 
 def test_unfinished_split_is_reported_before_messages_are_read(tmp_path: Path) -> None:
-    """The command `info` reads few messages, and none to the end."""
+    """`info` does not read all messages, so it would not report that a split is unfinished."""
     write_mcap(tmp_path / "b_0.mcap", [3, 8])
     write_mcap(tmp_path / "b_1.mcap", [10, 20], finish=False)
 
@@ -550,7 +550,7 @@ QOS = Qos(
 
 
 def two_publishers(path: Path, container: str) -> Path:
-    """Write three and four messages on /a, by two publishers, and two on /b."""
+    """Write three messages of one publisher on /a, four of another, and two on /b."""
     published = [("/a", "one", 3), ("/a", "two", 4), ("/b", "one", 2)]
     if container == "mcap":
         with mcap_writer(path) as writer:
@@ -581,7 +581,7 @@ def two_publishers(path: Path, container: str) -> Path:
 
 @pytest.mark.parametrize("container", ["mcap", "ros1", "MCAP", "SQLITE3"])
 def test_topic_count_includes_all_publishers(tmp_path: Path, container: str) -> None:
-    """The count decides which topic is chosen, and is the total of the progress."""
+    """The count decides which topic is chosen, and progress is shown relative to it."""
     suffix = {"mcap": ".mcap", "ros1": ".bag"}.get(container, "")
     with open_recording(two_publishers(tmp_path / f"lab{suffix}", container)) as recording:
         assert [(topic.name, topic.count) for topic in recording.topics] == [("/a", 7), ("/b", 2)]
@@ -672,7 +672,7 @@ def test_unreadable_file_gives_one_line_error(
 
 
 def test_pipe_in_a_folder_is_no_recording(tmp_path: Path) -> None:
-    """Opening it would wait for its writer, and so would all other recordings."""
+    """Opening a pipe waits for its writer; a pipe among recordings would stop the whole run."""
     os.mkfifo(tmp_path / "pipe.mcap")
     writer = os.open(tmp_path / "pipe.mcap", os.O_RDWR)  # so that a failing test ends
     os.write(writer, bytes(16))
@@ -684,7 +684,7 @@ def test_pipe_in_a_folder_is_no_recording(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["lab%41.db3", "run#1.db3", "what?.db3", "a%20#b/c.db3"])
 def test_database_may_have_signs_of_urls_in_its_path(tmp_path: Path, name: str) -> None:
-    """SQLite took them for those of a URL: it found no such file, or read another one."""
+    """SQLite read the path as a URL: it found no file, or opened another one."""
     whole = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
     (tmp_path / name).parent.mkdir(exist_ok=True)
     whole.rename(tmp_path / name)
@@ -746,7 +746,7 @@ def test_odd_file_is_read_or_refused(path: Path) -> None:
 
 
 def killed_recorder(path: Path) -> Path:
-    """Write a database whose last two messages are in its write-ahead log alone."""
+    """Write, in a folder, a database whose last two messages are only in its write-ahead log."""
     import sqlite3  # noqa: PLC0415  only used here
 
     whole, left = write_folder(path / "bag", StoragePlugin.SQLITE3) / "bag.db3", path / "left"
@@ -825,7 +825,7 @@ module builtin_interfaces {
 
 
 def test_messages_defined_in_idl_are_decoded(tmp_path: Path) -> None:
-    """``ros2 bag record`` stores IDL, with its includes, of packages without .msg files."""
+    """For packages without .msg files, ``ros2 bag record`` stores the IDL and its includes."""
     data = b"\0\1\0\0" + struct.pack("<iIdI3h", 17, 250, 4.5, 3, 2, -3, 5)
     with mcap_writer(tmp_path / "a.mcap") as writer:
         one = IDL.rpartition("IDL: ")[2].partition("\n")[2]
@@ -855,7 +855,7 @@ def test_messages_defined_in_idl_are_decoded(tmp_path: Path) -> None:
 def test_reason_why_messages_cannot_be_decoded_is_given(
     tmp_path: Path, encoding: str, definition: bytes, reason: str
 ) -> None:
-    """A KeyError of the encoding alone says nothing; a long definition takes minutes to parse."""
+    """A bare KeyError would not tell the reason; a long definition takes minutes to parse."""
     with mcap_writer(tmp_path / "a.mcap") as writer:
         schema = writer.register_schema("a/msg/Text", "ros2msg", definition)
         channel = writer.register_channel("/a", encoding, schema)

@@ -52,6 +52,7 @@ Pairs = list[tuple[Frame, ColourView | None]]
 def read(
     path: Path, wanted: str | None = None, topics: Sequence[str] = (), **frame_range: Any
 ) -> tuple[Pairs, list[str]]:
+    """Return frames and their colour, and the warnings; ``wanted`` is the colour topic."""
     with open_recording(path) as recording:
         streams = choose_streams(recording, topics)
         colours = pair_colours(recording, streams, wanted)
@@ -89,7 +90,7 @@ def paired(
     distortion: Sequence[float] = (0.1, -0.2, 0.001, 0.002, 0.0),
     **options: Any,
 ) -> Path:
-    """Write a depth image with a colour image of another camera."""
+    """Write a depth image, a colour image of another camera, and ``more`` messages."""
     items = depth_items(EPOCH)
     items += [("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE, distortion))]
     colours = raw(EPOCH, gradient(60, 80), "rgb8", frame_id)
@@ -167,7 +168,7 @@ def test_yuv_encodings_order_luma_and_chroma_correctly(encoding: str) -> None:
 
 
 def test_packed_point_colours_are_read_at_their_offset() -> None:
-    """PCL's float holds 0x00RRGGBB; read as a number it gives black objects."""
+    """PCL packs 0x00RRGGBB into a float; read as a number, it would make all objects black."""
     points = organized_points(wavy_depth())
     data = np.zeros((48, 64), np.dtype([("xyz", "<f4", 3), ("pad", "<f4"), ("rgb", "<u4")]))
     data["xyz"] = points
@@ -186,7 +187,7 @@ def test_packed_point_colours_are_read_at_their_offset() -> None:
 
 
 def test_cloud_colours_are_registered_to_its_points(tmp_path: Path) -> None:
-    """They need no second topic."""
+    """A cloud may hold its colours; without an image topic, they would be lost."""
     points = organized_points(wavy_depth())
     data = np.zeros((48, 64), np.dtype([("xyz", "<f4", 3), ("rgb", "<u4")]))
     data["xyz"], data["rgb"] = points, 0x0A141E
@@ -227,7 +228,7 @@ def test_jpeg_is_decoded_at_a_fraction_of_its_size(shrink: int, size: tuple[int,
 
 
 def test_compressed_colour_stream_is_preferred(tmp_path: Path) -> None:
-    """The wrong one of five streams of a camera must not be chosen."""
+    """Infrared images, or those of another camera, must not be taken for the colour."""
     items = depth_items(EPOCH)
     for topic in ("/cam/infra1/image", "/cam/color/image_raw", "/other/color/image_raw"):
         encoding = "mono8" if "infra" in topic else "rgb8"
@@ -287,7 +288,7 @@ def test_frames_pair_with_nearest_image_within_half_a_period(tmp_path: Path) -> 
 
 
 def test_frame_pairs_with_the_image_of_its_time_not_of_its_arrival(tmp_path: Path) -> None:
-    """Of two images that jitter puts near a frame, the farther one may arrive with it."""
+    """Delays vary, so the image that arrives with a frame need not be the nearest in time."""
     colours = [
         ("/cam/color/image_raw", EPOCH + arrival * MS, raw(EPOCH + t * MS, gradient(), "rgb8"))
         for t, arrival in ((0, 10), (100, 110), (200, 210), (300, 345), (340, 350), (440, 450))
@@ -301,7 +302,7 @@ def test_frame_pairs_with_the_image_of_its_time_not_of_its_arrival(tmp_path: Pat
 
 @pytest.mark.parametrize("early", [False, True])
 def test_pairing_keeps_to_its_side_of_a_clock_step(tmp_path: Path, early: bool) -> None:
-    """After a clock was set back by 0.2 s, images from before had the same stamps: wrong masks."""
+    """After a clock is set back, earlier images have the same stamps: masks would be wrong."""
     stamps = [EPOCH + (33 * k - 198 * (k > 9)) * MS for k in range(20)]
     logged = [EPOCH + 33 * k * MS for k in range(20)]
     items: list[tuple[str, int, Any]] = []
@@ -329,7 +330,7 @@ def test_pairing_waits_for_image_logged_late(tmp_path: Path) -> None:
 
 
 def test_image_is_kept_for_depth_logged_late(tmp_path: Path) -> None:
-    """Stereo matching takes time, while a colour camera of 60 Hz goes on: no frame had colour."""
+    """Depth may come dozens of colour images late; were these dropped, no frame had colour."""
     stamps = [EPOCH + 100 * k * MS for k in range(3)]
     items = [(t, time + 600 * MS, message) for t, time, message in depth_items(*stamps)]
     times = [EPOCH + round(k * 1000 / 60 * MS) for k in range(50)]
@@ -342,7 +343,7 @@ def test_image_is_kept_for_depth_logged_late(tmp_path: Path) -> None:
 def test_images_kept_for_late_depth_are_limited_in_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Waiting for depth, 64 raw images of 12 megapixels would take 2 GB."""
+    """64 raw images of 12 megapixels that wait for depth would take 2 GB."""
     monkeypatch.setattr(colour_frames, "_BUFFERED_BYTES", 3 * gradient().nbytes)
     times = [EPOCH + 20 * k * MS for k in range(10)]
     items = [(t, times[-1] + MS, message) for t, _, message in depth_items(times[5], times[8])]
@@ -354,7 +355,7 @@ def test_images_kept_for_late_depth_are_limited_in_bytes(
 
 @pytest.mark.parametrize("bare", [0, 2])
 def test_missing_stamps_are_estimated_in_simulated_time(tmp_path: Path, bare: int) -> None:
-    """Simulated time begins near 0: at the log time, decades later, a frame gets new tracks."""
+    """Simulated time begins near 0; with the log time as stamp, objects would get new tracks."""
     expected = [7 + k * SECOND for k in range(4)]
     items = depth_items(*expected)
     items += [("/cam/color/image_raw", t + 9, raw(t, gradient(), "rgb8")) for t in expected]
@@ -370,7 +371,7 @@ def test_missing_stamps_are_estimated_in_simulated_time(tmp_path: Path, bare: in
 
 @pytest.mark.parametrize("kind", ["nv12", "h264", "foxglove.CompressedVideo"])
 def test_unread_colour_is_reported(tmp_path: Path, kind: str) -> None:
-    """A run without colour did not say that the recording has some."""
+    """Users did not learn that their recording has colour that cannot be read."""
     items = [
         *depth_items(EPOCH),
         ("/cam/aligned_depth_to_color", EPOCH, image(EPOCH, wavy_depth())),
@@ -408,7 +409,7 @@ def test_damaged_images_are_skipped_and_reported(tmp_path: Path) -> None:
 
 
 def test_damaged_raw_images_are_skipped_and_reported(tmp_path: Path) -> None:
-    """They must not be counted as images of the run and fail when they are shown."""
+    """Damaged images must not be counted as images of the run, and fail when they are shown."""
     stamps = [EPOCH + 100 * k * MS for k in range(4)]
     images = [raw(stamp, gradient(), "rgb8") for stamp in stamps]
     images[0].data = images[0].data[:100]
@@ -441,7 +442,7 @@ def test_damaged_image_is_message_error() -> None:
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
 def test_non_finite_distortion_is_reported(tmp_path: Path, wrong: float) -> None:
-    """Otherwise all masks would be empty without a reason."""
+    """Otherwise all masks would be empty without an explanation."""
     tf = ("/tf_static", EPOCH, static("camera", "color_optical", (0.05, 0, 0), (0, 0, 0, 1)))
     ((_, view),), warnings = read(paired(tmp_path / "a.mcap", tf, distortion=(wrong, 0, 0, 0, 0)))
 
@@ -467,7 +468,7 @@ def test_pose_of_colour_camera_comes_from_transforms(tmp_path: Path) -> None:
 
 
 def test_moving_colour_camera_has_new_pose_in_each_frame(tmp_path: Path) -> None:
-    """Only a static transform may be kept; the first pose would colour all later frames."""
+    """If the first pose were kept for all frames, later ones would get the wrong colours."""
     items = [
         *depth_items(EPOCH, EPOCH + SECOND),
         ("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)),
@@ -484,7 +485,7 @@ def test_moving_colour_camera_has_new_pose_in_each_frame(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("first_s", [0.0, 0.1])
 def test_calibration_recorded_once_is_used_for_all_images(tmp_path: Path, first_s: float) -> None:
-    """Latched, it may come after the first images, or before those that --start selects."""
+    """A latched CameraInfo may come after the first images, or before those --start selects."""
     once = EPOCH + round(first_s * SECOND)
     items = [("/cam/color/camera_info", once, info(once, WIDE))]
     for stamp in (EPOCH, EPOCH + 50 * MS, EPOCH + 100 * MS):
@@ -521,7 +522,7 @@ def test_calibrations_of_zeros_do_not_replace_one(tmp_path: Path, zeros: Sequenc
 
 
 def test_sensors_without_frame_ids_do_not_share_their_colour(tmp_path: Path) -> None:
-    """Some drivers leave all ids empty, which is not the same frame."""
+    """Some drivers leave frame ids empty; two empty ids do not mean the same frame."""
     items: list[tuple[str, int, Any]] = []
     for name in ("a", "b"):
         items.append((f"/{name}/depth/camera_info", EPOCH, info(EPOCH)))
@@ -600,9 +601,9 @@ def test_realsense_extrinsics_are_read_column_by_column(tmp_path: Path) -> None:
     ("metres", "expected"),
     [
         ({"/cam1": 1.0, "/cam2": 2.0}, 2.0),
-        ({"/cam": 3.0, "/cam2": 2.0}, 2.0),  # not a part of the name
+        ({"/cam": 3.0, "/cam2": 2.0}, 2.0),  # /cam is not the namespace of /cam2
         ({"/cam1": 1.0, "/cam2": np.nan}, None),
-        ({"": 3.0, "/cam2": 2.0}, 2.0),  # the nearer one
+        ({"": 3.0, "/cam2": 2.0}, 2.0),  # the nearer namespace
         ({"": 3.0, "/cam2": np.nan}, 3.0),
         ({"/cam1": 1.0}, 1.0),
         ({"/cam1": 1.0, "/cam3": 2.0}, None),
@@ -611,7 +612,7 @@ def test_realsense_extrinsics_are_read_column_by_column(tmp_path: Path) -> None:
 def test_extrinsics_are_those_of_the_same_camera(
     monkeypatch: pytest.MonkeyPatch, metres: dict[str, float], expected: float | None
 ) -> None:
-    """With two cameras, colours would be projected with the calibration of the other one."""
+    """With two cameras, colours could be projected with the extrinsics of the other camera."""
     topics = {f"{space}/extrinsics/depth_to_color": x for space, x in metres.items()}
     messages = {
         name: SimpleNamespace(rotation=np.eye(3).ravel(), translation=[x, 0, 0])
@@ -649,7 +650,7 @@ def test_simulated_colour_camera_is_equal_in_all_containers(tmp_path: Path, cont
 
 
 def test_unreadable_colour_messages_are_skipped_and_reported(tmp_path: Path) -> None:
-    """One truncated message must not end the run; one of another type is not an image at all."""
+    """Neither a truncated message nor one of another type may end the run."""
     stamps = [EPOCH + k * 33 * MS for k in range(8)]
     messages: list[Any] = [raw(s, gradient(), "rgb8") for s in stamps]
     messages[5] = make("std_msgs/msg/String", "calibrating")
@@ -669,7 +670,7 @@ def test_unreadable_colour_messages_are_skipped_and_reported(tmp_path: Path) -> 
 
 
 def test_json_image_without_data_is_reported(tmp_path: Path) -> None:
-    """It ended the run in a traceback, as only ROS definitions guarantee the fields."""
+    """JSON messages may lack fields; an image without data ended the run with a traceback."""
     path, stamps = tmp_path / "a.mcap", [EPOCH, EPOCH + 33 * MS]
     stamp = {"sec": EPOCH // SECOND, "nanosec": 0}
     content = {"header": {"stamp": stamp, "frame_id": "camera"}, "encoding": "rgb8"}
@@ -688,13 +689,13 @@ def test_json_image_without_data_is_reported(tmp_path: Path) -> None:
 
 
 def test_image_in_unknown_encoding_is_message_error() -> None:
-    """Its bytes would be mistaken for those of another encoding."""
+    """The bytes would be mistaken for those of another encoding."""
     with pytest.raises(MessageError, match="encoding '32FC1' is not colour"):
         pixels_of(ColourImage("", 0, 0, "", "32FC1", 4, 3, 16, bytes(48)))
 
 
 def test_clouds_that_lose_their_colours_are_reported(tmp_path: Path) -> None:
-    """Their objects would have the colours of earlier clouds, or none without a reason."""
+    """Objects would have the colours of an earlier cloud, or none without an explanation."""
     points = organized_points(wavy_depth())
     data = np.zeros(48 * 64, [("xyz", "<f4", 3), ("rgb", "<u4")])
     data["xyz"], data["rgb"] = points.reshape(-1, 3), 0x0A141E
@@ -726,7 +727,7 @@ def test_raw_image_is_exported_as_png_with_the_same_pixels() -> None:
 
 
 def test_colour_camera_without_transform_at_some_frames_is_reported(tmp_path: Path) -> None:
-    """A pan-tilt unit that starts late: the first frames would have no colour without a reason."""
+    """If a pan-tilt unit starts late, the user must learn why the first frames have no colour."""
     items = [
         *depth_items(EPOCH, EPOCH + 2 * SECOND),
         ("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)),

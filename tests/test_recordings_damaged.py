@@ -37,7 +37,7 @@ def read(path: Path) -> tuple[list[int], list[str]]:
 
 
 def replace(path: Path, old: bytes, new: bytes, nth: int = 0) -> None:
-    """Replace an occurrence of some bytes in a file."""
+    """Replace one occurrence of ``old`` in a file; ``nth`` counts from 0."""
     data = path.read_bytes()
     at = -1
     for _ in range(nth + 1):
@@ -50,7 +50,7 @@ def replace(path: Path, old: bytes, new: bytes, nth: int = 0) -> None:
 
 @pytest.mark.parametrize(("opcode", "warned"), [(0x40, True), (0x90, False)])
 def test_records_of_unknown_kind_are_skipped(tmp_path: Path, opcode: int, warned: bool) -> None:
-    """Opcodes of 0x80 and above are for private use; a later format might define the others."""
+    """A later format may define opcodes below 0x80, so these are reported; the rest is private."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, "", use_chunking=False, index_types=IndexType.NONE) as writer:
         channel = writer.register_channel("/a", "raw", 0)
@@ -69,7 +69,7 @@ def test_records_of_unknown_kind_are_skipped(tmp_path: Path, opcode: int, warned
 
 @pytest.mark.parametrize("damaged", ["", "std/String", "/topic"])
 def test_index_without_checksum_is_compared_with_the_chunks(tmp_path: Path, damaged: str) -> None:
-    """Messages would be read under a name or type that was not recorded."""
+    """A damaged index would give messages a topic or a type that was not recorded."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, enable_crcs=False, compression=CompressionType.NONE) as writer:
         schema = writer.register_schema("std/String", "ros1msg", b"string data")
@@ -96,7 +96,7 @@ def test_index_without_checksum_is_compared_with_the_chunks(tmp_path: Path, dama
 def test_destroyed_messages_count_where_messages_are_chosen(
     tmp_path: Path, needed: set[int] | None, full: list[int], without_data: list[int]
 ) -> None:
-    """A frame of a run is found again by its number, whether its neighbours are read or not."""
+    """Frames are found again by number; it must not depend on which messages can be read."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, chunk_size=120) as writer:
         channel = writer.register_channel("/a", "x-text", 0)
@@ -112,7 +112,7 @@ def test_destroyed_messages_count_where_messages_are_chosen(
 
 
 def test_messages_out_of_order_count_once_in_a_chunk_read_in_part(tmp_path: Path) -> None:
-    """Recorders with several threads do not sort: one would count twice, and another not at all."""
+    """Recorders with threads do not sort: a message would count twice, another one not at all."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path) as writer:
         channel = writer.register_channel("/a", "x-text", 0)
@@ -126,7 +126,7 @@ def test_messages_out_of_order_count_once_in_a_chunk_read_in_part(tmp_path: Path
 
 @pytest.mark.parametrize("checked", [False, True])
 def test_damaged_index_is_not_called_missing(tmp_path: Path, *, checked: bool) -> None:
-    """Two warnings contradicted each other, or the only one was wrong."""
+    """Users were told that a damaged index is missing, or that it is both damaged and missing."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, enable_crcs=checked, compression=CompressionType.NONE) as writer:
         channel = writer.register_channel("/topic", "x-text", 0)
@@ -139,7 +139,7 @@ def test_damaged_index_is_not_called_missing(tmp_path: Path, *, checked: bool) -
 
 
 def test_index_that_lacks_a_chunk_is_not_used(tmp_path: Path) -> None:
-    """Without a checksum only the number of chunks tells; its messages would be missing."""
+    """The chunk's messages would be missing; without a checksum, only the chunk count tells."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, enable_crcs=False, chunk_size=60) as writer:
         channel = writer.register_channel("/a", "x-text", 0)
@@ -156,7 +156,7 @@ def test_index_that_lacks_a_chunk_is_not_used(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("damage", "wanted"), [("time", 5), ("place", 3)])
 def test_damaged_index_of_a_chunk_is_not_used(tmp_path: Path, damage: str, wanted: int) -> None:
-    """It has no checksum. A frame that it hides is in the tables, but not in the review."""
+    """Such an index has no checksum; frames it hides would be in the tables, not in the review."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, compression=CompressionType.NONE) as writer:
         channel = writer.register_channel("/a", "x-text", 0)
@@ -176,7 +176,7 @@ def test_damaged_index_of_a_chunk_is_not_used(tmp_path: Path, damage: str, wante
 
 
 def test_damage_is_reported_once_in_whatever_part_of_a_chunk(tmp_path: Path) -> None:
-    """A checksum fails in the whole chunk, a length in its first part."""
+    """A wrong length is found in part of a chunk, a wrong checksum in all of it: two warnings."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, compression=CompressionType.NONE) as writer:
         channel = writer.register_channel("/a", "x-text", 0)
@@ -193,7 +193,7 @@ def test_damage_is_reported_once_in_whatever_part_of_a_chunk(tmp_path: Path) -> 
 
 
 def test_damage_is_reported_once_and_only_where_it_is_read(tmp_path: Path) -> None:
-    """Comparing an index with the chunks reads all of them; a run of other topics lacks nothing."""
+    """Checking the index reads all chunks, but a run loses nothing if it needs other topics."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, enable_crcs=False, chunk_size=60) as writer:
         for name, time in (("/a", 3), ("/b", 5)):
@@ -213,7 +213,7 @@ def test_damage_is_reported_once_and_only_where_it_is_read(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "nth", "reason"),  # of the second chunk: the first one holds the channel
+    ("old", "new", "nth", "reason"),  # in the second chunk; the first one also holds the channel
     [
         (b"\4\0\0\0zstd", b"\4\0\0\0zst9", 1, "chunk compression 'zst9' is not supported"),
         (struct.pack("<Q", 83), struct.pack("<Q", 82), 0, "83 bytes where the header says 82"),
@@ -222,7 +222,7 @@ def test_damage_is_reported_once_and_only_where_it_is_read(tmp_path: Path) -> No
 def test_chunk_that_is_not_what_it_claims_is_skipped(
     tmp_path: Path, old: bytes, new: bytes, nth: int, reason: str
 ) -> None:
-    """Its messages would be missing without a word, or of any length."""
+    """The chunk's messages would be missing without a warning, or have wrong lengths."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, compression=CompressionType.ZSTD, chunk_size=60) as writer:
         channel = writer.register_channel("/a", "x-text", 0)
@@ -238,7 +238,7 @@ def test_chunk_that_is_not_what_it_claims_is_skipped(
 
 
 def test_finished_file_that_is_damaged_is_not_called_unfinished(tmp_path: Path) -> None:
-    """A copy that lost a block has both ends: recording again would not help, copying would."""
+    """If a copy lost a block, the user should copy the file again, not record again."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, chunk_size=60) as writer:
         channel = writer.register_channel("/a", "x-text", 0)
@@ -258,7 +258,7 @@ def test_finished_file_that_is_damaged_is_not_called_unfinished(tmp_path: Path) 
 
 
 def test_messages_that_cannot_be_assigned_are_reported(tmp_path: Path) -> None:
-    """A recorder that lost its channels, or was killed, loses messages without a word."""
+    """Messages without a channel, or cut short, would be missing without a warning."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, finish=False, use_chunking=False) as writer:
         channel = writer.register_channel("/a", "x-text", 0)
@@ -278,7 +278,7 @@ def test_messages_that_cannot_be_assigned_are_reported(tmp_path: Path) -> None:
 
 
 def test_message_that_claims_to_be_huge_is_not_unpacked(tmp_path: Path) -> None:
-    """One damaged byte would take all memory."""
+    """One damaged byte in a size field could exhaust memory."""
     claim = b"\x28\xb5\x2f\xfd\xc0\x00" + struct.pack("<Q", (1 << 30) + 1)
     with mcap_writer(tmp_path / "a.mcap") as writer:
         schema = writer.register_schema(STRING, "ros2msg", b"string data")
@@ -295,7 +295,7 @@ def test_message_that_claims_to_be_huge_is_not_unpacked(tmp_path: Path) -> None:
 def test_error_of_the_disk_names_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was a traceback of `info`, or blamed the file that an export was writing."""
+    """`info` ended with a traceback, and an export blamed the file that it was writing."""
     path = tmp_path / "a.mcap"
     write_mcap(path, [5])
 
@@ -317,7 +317,7 @@ def test_error_of_the_disk_names_the_recording(
 
 
 def test_encrypted_bag_is_refused_with_its_method(tmp_path: Path) -> None:
-    """Its chunks look like damaged ones."""
+    """Encrypted chunks look damaged; the user must learn the real reason."""
     path = bag_of(tmp_path / "a.bag")
     data, begin = path.read_bytes(), len(b"#ROSBAG V2.0\n")
     (size,) = struct.unpack_from("<I", data, begin)
@@ -359,7 +359,7 @@ def test_bag_chunk_that_unpacks_to_too_much_is_skipped(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("broken", ["place", "connection"])
 def test_bag_with_a_wrong_index_is_read_without_it(tmp_path: Path, broken: str) -> None:
-    """Tools that cut bags leave the index of the whole bag; its messages would be missing."""
+    """Tools that cut bags may keep the old index; messages it misplaces would be missing."""
     path = bag_of(tmp_path / "a.bag")
     whole = times_read(path)
     data = path.read_bytes()
@@ -385,7 +385,7 @@ def test_bag_with_a_wrong_index_is_read_without_it(tmp_path: Path, broken: str) 
 
 @pytest.mark.parametrize("hole", ["length", "header"])
 def test_bag_is_read_on_after_a_hole(tmp_path: Path, hole: str) -> None:
-    """One bad sector would cost the rest of a day, although the index lists its chunks."""
+    """One bad sector would cost all later messages, although the index lists their chunks."""
     path = bag_of(tmp_path / "a.bag")
     data = path.read_bytes()
     ops = [at for at in range(len(data)) if data.startswith(b"op=\x05", at)]
@@ -417,7 +417,7 @@ def test_damaged_record_of_a_bag_is_reported_with_its_place(tmp_path: Path) -> N
 
 
 def test_bag_messages_of_an_unknown_connection_are_reported(tmp_path: Path) -> None:
-    """They cannot be decoded."""
+    """Their topic is unknown; the messages would be missing without a warning."""
     path = bag_of(tmp_path / "a.bag")
     data = path.read_bytes()
     at = data.index(b"op=\x02")
@@ -433,7 +433,7 @@ def test_bag_messages_of_an_unknown_connection_are_reported(tmp_path: Path) -> N
 
 
 def test_message_lost_in_a_bag_chunk_is_reported(tmp_path: Path) -> None:
-    """A damaged opcode hides a message; only the count in the index tells."""
+    """A damaged opcode hides a message; only the count in the index reveals the loss."""
     path = bag_of(tmp_path / "a.bag")
     data = path.read_bytes()
     at = data.index(b"op=\x02") + len(b"op=")
@@ -450,7 +450,7 @@ def test_message_lost_in_a_bag_chunk_is_reported(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("time", ["'a text'", "NULL", "-5"])
 def test_database_message_without_time_is_skipped_and_reported(tmp_path: Path, time: str) -> None:
-    """It cannot be sorted, or written to annotated.mcap."""
+    """Such a message can be neither sorted nor written to annotated.mcap."""
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
     with closing(sqlite3.connect(path)) as base:
         (made,) = base.execute("SELECT sql FROM sqlite_master WHERE name = 'messages'").fetchone()
@@ -467,7 +467,7 @@ def test_database_message_without_time_is_skipped_and_reported(tmp_path: Path, t
 
 
 def test_database_message_without_bytes_is_skipped_and_reported(tmp_path: Path) -> None:
-    """Scripts that edit bags with SQL leave such rows."""
+    """Scripts that edit bags with SQL may leave text as data; this must not end a run."""
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
     with closing(sqlite3.connect(path)) as base:
         base.execute("UPDATE messages SET data = 'a text' WHERE timestamp = ?", (2 * SECOND,))
@@ -481,7 +481,7 @@ def test_database_message_without_bytes_is_skipped_and_reported(tmp_path: Path) 
 
 @pytest.mark.parametrize("counted", [False, True])
 def test_damaged_message_of_a_database_is_skipped(tmp_path: Path, *, counted: bool) -> None:
-    """One bad page would cost the rest of a bag; where frames are numbered, it counts."""
+    """One bad page must not cost the rest of a bag, nor change the numbers of later frames."""
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
     with closing(sqlite3.connect(path)) as base:
         rows = [(10 * SECOND + k, text("x" * 12_000 + str(k))) for k in range(9)]
@@ -489,7 +489,7 @@ def test_damaged_message_of_a_database_is_skipped(tmp_path: Path, *, counted: bo
         base.commit()
         (size,) = base.execute("PRAGMA page_size").fetchone()
     data = bytearray(path.read_bytes())
-    last = data.index(b"x4\0") // size  # the last page of a message, to which another one points
+    last = data.index(b"x4\0") // size  # the last page of a message, to which another page points
     pages = range(0, len(data), size)
     (before,) = (at for at in pages if data[at : at + 4] == struct.pack(">I", last + 1))
     data[before : before + 4] = b"\xff" * 4
@@ -510,7 +510,7 @@ def test_damaged_message_of_a_database_is_skipped(tmp_path: Path, *, counted: bo
 
 
 def test_database_is_read_up_to_where_it_ends_too_early(tmp_path: Path) -> None:
-    """The first hour of a bag on a failing disk is still of use, if one knows what is missing."""
+    """The first hour of a bag on a failing disk is still useful, if the user knows that it ends."""
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
     with closing(sqlite3.connect(path)) as base:  # more than the library keeps in memory
         rows = [(10 * SECOND + k, text("x" * 3000)) for k in range(1500)]
@@ -530,7 +530,7 @@ def test_database_is_read_up_to_where_it_ends_too_early(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
 def test_folder_named_like_a_part_is_none(tmp_path: Path, plugin: StoragePlugin) -> None:
-    """The error was that it is a directory, or that a file does not exist."""
+    """A subfolder old.mcap or old.db3 made a bag unreadable, with a misleading error."""
     bag = write_folder(tmp_path / "bag", plugin)
     (bag / "metadata.yaml").unlink()
     (bag / f"old.{'mcap' if plugin == StoragePlugin.MCAP else 'db3'}").mkdir()
@@ -542,7 +542,7 @@ def test_folder_named_like_a_part_is_none(tmp_path: Path, plugin: StoragePlugin)
 
 
 def test_damaged_temporary_copy_is_not_named(tmp_path: Path) -> None:
-    """It is gone when the user reads the error, which names the recording anyway."""
+    """The copy is gone when the user reads the error, so its path would not help."""
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
     whole = path.read_bytes()
     for data, reason in (
@@ -572,7 +572,7 @@ def test_damaged_temporary_copy_is_not_named(tmp_path: Path) -> None:
 def test_folder_without_readable_part_is_refused_with_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes, reason: str
 ) -> None:
-    """Nothing may remain of the parts that were unpacked."""
+    """Parts unpacked before the error must not remain in the temporary folder."""
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "metadata.yaml").write_text("")
     (tmp_path / "bag" / name).write_bytes(content)
@@ -587,7 +587,7 @@ def test_folder_without_readable_part_is_refused_with_the_reason(
 
 
 def test_damaged_part_of_a_folder_is_skipped_and_reported(tmp_path: Path) -> None:
-    """Minutes in the middle would be missing without a word; two parts share their folder."""
+    """Minutes in the middle of a recording would be missing without a warning."""
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.FILE)
     (part,) = path.glob("*.zstd")
     (path / "metadata.yaml").unlink()
@@ -601,7 +601,7 @@ def test_damaged_part_of_a_folder_is_skipped_and_reported(tmp_path: Path) -> Non
 
 
 def test_folder_without_messages_has_no_times(tmp_path: Path) -> None:
-    """A recorder stopped at once leaves such a bag; its start was that of the epoch or missing."""
+    """A recorder that is stopped at once leaves such a bag; it must be opened all the same."""
     (tmp_path / "bag").mkdir()
     write_mcap(tmp_path / "bag" / "bag_0.mcap", [])
 

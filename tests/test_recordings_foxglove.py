@@ -57,7 +57,7 @@ both_encodings = pytest.mark.parametrize("encoding", ["json", "protobuf"])
 def test_pose_is_applied_to_point_cloud(
     tmp_path: Path, encoding: str, angles: list[float], position: list[float]
 ) -> None:
-    """A pose that only shifts or only rotates is not the identity."""
+    """A pose that only shifts or only rotates must not be taken for the identity."""
     points = np.arange(12, dtype="<f4").reshape(4, 3) + 1
     fields = [{"name": name, "offset": 4 * k, "type": 7} for k, name in enumerate("xyz")]
     turn = Rotation.from_euler("zyx", angles)
@@ -83,7 +83,7 @@ def test_pose_is_applied_to_point_cloud(
 def test_coordinates_may_have_any_numeric_type(
     tmp_path: Path, encoding: str, number: int, kind: str
 ) -> None:
-    """Foxglove numbers the types unlike ROS: -7 would become a large number."""
+    """Foxglove's type numbers differ from those of ROS: -7 would become a large number."""
     extreme = np.iinfo(kind).max - 2 if "u" in kind else -7
     points = np.array([[extreme, 5, 9], [2, extreme, 7]]).astype(kind)
     size = points.itemsize
@@ -97,7 +97,7 @@ def test_coordinates_may_have_any_numeric_type(
 
 
 def test_foxglove_messages_in_ros_keep_nanoseconds(tmp_path: Path) -> None:
-    """ROS names them differently; all frames of a second would have the same stamp."""
+    """The field is nanosec in ROS, nsec in JSON; frames of one second would share a stamp."""
     kind, stamp = "foxglove_msgs/msg/PointCloud", EPOCH + 123_456_789
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(_CLOUD, kind))
@@ -137,7 +137,7 @@ uint8 type
 @both_encodings
 @pytest.mark.parametrize("compressed", [False, True])
 def test_depth_image_is_read(tmp_path: Path, encoding: str, *, compressed: bool) -> None:
-    """Compressed depth was called a depth stream, and then none of its images was read."""
+    """Compressed depth was listed as a depth stream, but none of its images could be read."""
     depth = np.arange(12, dtype="<u2").reshape(3, 4) * 100
     k = [60.0, 0.0, 1.5, 0.0, 61.0, 1.0, 0.0, 0.0, 1.0]
     size = {"width": 4, "height": 3}
@@ -158,7 +158,7 @@ def test_depth_image_is_read(tmp_path: Path, encoding: str, *, compressed: bool)
 
 
 def test_calibration_may_lack_the_fields_of_a_lens(tmp_path: Path) -> None:
-    """Programs that write JSON leave out what a pinhole camera does not need."""
+    """Programs that write JSON may leave out what a pinhole camera does not need."""
     size = {"width": 4, "height": 3}
     pixels = content(np.full((3, 4), 700, "<u2").tobytes(), "json")
     k = [60.0, 0.0, 1.5, 0.0, 61.0, 1.0, 0.0, 0.0, 1.0]
@@ -206,9 +206,9 @@ def test_transforms_are_read(
 
 @pytest.mark.parametrize("beside_ros", [False, True])
 def test_transform_long_before_first_frame_is_known(tmp_path: Path, *, beside_ros: bool) -> None:
-    """With --start, an earlier pose would be mistaken for the present one.
+    """Foxglove transforms hold until the next one; the last one before --start must be found.
 
-    A recording may hold transforms of ROS as well, which do not remain valid.
+    The recording may also hold ROS transforms, which do not hold for so long.
     """
     path = tmp_path / "a.mcap"
     with mcap_writer(path, "", chunk_size=100) as writer:
@@ -237,7 +237,7 @@ def test_transform_long_before_first_frame_is_known(tmp_path: Path, *, beside_ro
 
 
 def test_protobuf_scene_is_decoded_by_embedded_descriptors() -> None:
-    """A viewer knows no others."""
+    """A viewer knows only the descriptors that the file embeds."""
     scene = {
         "deletions": [{"timestamp": {"seconds": 5}, "type": 1, "id": "a"}],
         "entities": [{"id": "track-3", "frame_locked": True, "metadata": [{"key": "k"}]}],
@@ -308,7 +308,7 @@ def test_random_bytes_raise_only_known_errors(data: bytes) -> None:
 
 
 def test_descriptors_in_any_order_and_maps_are_decoded() -> None:
-    """Only some writers put a file behind those it imports; a map is not a list of messages."""
+    """Some writers put a file before those it imports; a map is encoded as a list of messages."""
     inner = FileDescriptorProto(name="inner.proto", package="lab", syntax="proto3")
     inner.message_type.add(name="Size").field.add(name="height", number=1, type=5, label=1)
     outer = FileDescriptorProto(name="outer.proto", package="lab", syntax="proto3")

@@ -68,7 +68,7 @@ def read(
 @pytest.mark.parametrize("container", ["mcap", "ros1", "ros2"])
 @pytest.mark.parametrize("end_s", [1e12, 1e300])
 def test_end_may_be_far_after_the_end(tmp_path: Path, container: str, end_s: float) -> None:
-    """Nanoseconds of such a time fit neither into a database nor into an integer."""
+    """In nanoseconds, 1e12 s do not fit into a database, and 1e300 s are infinite."""
     path = record(tmp_path / "lab", 3, container=container)
 
     assert len(read(path, end_s=end_s)[0]) == 3
@@ -76,7 +76,7 @@ def test_end_may_be_far_after_the_end(tmp_path: Path, container: str, end_s: flo
 
 
 def test_messages_of_another_type_on_the_topic_are_no_frames(tmp_path: Path) -> None:
-    """Two nodes may publish under one name: the numbers of frames would depend on the other."""
+    """Two nodes may publish on one topic; other messages must not change the frame numbers."""
     items = []
     for k in range(3):
         stamp = EPOCH + k * SECOND
@@ -98,9 +98,9 @@ def test_messages_of_another_type_on_the_topic_are_no_frames(tmp_path: Path) -> 
 def test_needed_frames_equal_those_of_full_read(
     tmp_path: Path, chunk_size: int, *, latched: bool
 ) -> None:
-    """In an indexed file the others are skipped, but still counted.
+    """In an indexed file, frames that are not needed are skipped, but still counted.
 
-    The last image waits for a calibration, which may come only once.
+    The calibration comes with each image or, if latched, only once.
     """
     items = []
     for k in range(12):
@@ -132,9 +132,9 @@ def test_needed_frames_equal_those_of_full_read(
 def test_frames_after_damage_have_the_numbers_of_full_read(
     tmp_path: Path, damage: str, *, latched: bool
 ) -> None:
-    """What damage has destroyed is counted by the index alone, where it need not be read.
+    """Destroyed messages count in the frame numbers, even if only the index lists them.
 
-    Otherwise a review, a report or every n-th frame of a run showed frames that were others.
+    Otherwise a review, a report or a run of every n-th frame would show the wrong frames.
     """
     items: list[tuple[str, int, Any]] = []
     for k in range(20):
@@ -165,14 +165,14 @@ def test_frames_after_damage_have_the_numbers_of_full_read(
     assert lost
     assert max(lost) < every_2nd[-4].index
     assert skipped == {"cannot decode sensor_msgs/msg/Image: it has no data": len(lost)}
-    assert ["damaged" in warning for warning in warnings] == [True]  # calibrations lost with it
+    assert ["damaged" in warning for warning in warnings] == [True]
     assert [(frame.index, frame.stamp_ns) for frame in again] == [
         (frame.index, frame.stamp_ns) for frame in every_2nd[-4::3]
     ]
 
 
 def test_depth_image_and_organized_cloud_give_same_frame(tmp_path: Path) -> None:
-    """The objects must not depend on what a driver recorded."""
+    """Objects must not depend on whether depth images or clouds were recorded."""
     depth = wavy_depth()
     items = [
         ("/cam/depth/camera_info", 0, info(EPOCH)),
@@ -193,7 +193,7 @@ def test_depth_image_and_organized_cloud_give_same_frame(tmp_path: Path) -> None
 
 
 def test_fitted_intrinsics_change_only_with_camera(tmp_path: Path) -> None:
-    """Noise must not shift the camera; another camera must replace it."""
+    """Noise must not change the intrinsics; another camera must."""
     rng = np.random.default_rng(0)
     clean = organized_points(wavy_depth())
     noisy = [clean + rng.normal(0, 1e-5, clean.shape) for _ in range(4)]
@@ -210,7 +210,7 @@ def test_fitted_intrinsics_change_only_with_camera(tmp_path: Path) -> None:
 
 
 def test_earlier_camera_is_not_used_for_points_that_do_not_fit(tmp_path: Path) -> None:
-    """Their depth in another cloud's camera would give wrong points."""
+    """Converted to depth with another cloud's camera, they would become wrong points."""
     fitting = organized_points(wavy_depth())
     other = np.random.default_rng(0).normal(0, 1, fitting.shape).astype(np.float32)
     items = [("/points", k, cloud(EPOCH + k, p)) for k, p in enumerate((fitting, other, fitting))]
@@ -286,7 +286,7 @@ def test_padding_behind_the_rows_of_a_depth_image_is_skipped(tmp_path: Path, kin
 
 
 def test_image_with_step_zero_is_read_and_frames_are_counted(tmp_path: Path) -> None:
-    """A step of 0 means contiguous rows; the number of frames in a window is unknown."""
+    """A step of 0 means contiguous rows. Frames cannot be counted in advance in a time window."""
     depth = np.arange(500, 500 + 5 * 7, dtype=np.uint16).reshape(5, 7)
     packed = image(EPOCH, depth)
     packed.step = 0
@@ -339,7 +339,7 @@ def test_cloud_layout_does_not_change_coordinates(data: st.DataObject) -> None:
 
 
 def test_cloud_with_row_step_zero_is_read() -> None:
-    """Drivers leave it out, as the step of images: the rows then follow each other."""
+    """Some drivers leave out the row step of clouds too; the rows are then contiguous."""
     points = np.random.default_rng(2).normal(size=(2, 3, 3)).astype(np.float32)
 
     np.testing.assert_array_equal(cloud_points(cloud(0, points, row_step=0)), points)
@@ -367,7 +367,7 @@ def test_inconsistent_cloud_is_refused_before_allocation(
 def test_cloud_without_coordinates_names_missing_fields(
     tmp_path: Path, names: Sequence[str], missing: str
 ) -> None:
-    """The names of the other fields alone, "X, Y, Z", would look right."""
+    """If the error listed only the fields present, "X, Y, Z", nothing would look wrong."""
     points = np.random.default_rng(0).normal(1, 0.1, (1, 50, 3)).astype(np.float32)
     message = cloud(EPOCH, points)
     for field, name in zip(message.fields, names, strict=False):
@@ -415,7 +415,7 @@ def test_definition_without_fields_of_its_type_is_skipped(tmp_path: Path) -> Non
 
 
 def test_impossible_stamps_and_log_times_are_counted(tmp_path: Path) -> None:
-    """Tables hold only 63 bits."""
+    """Tables hold times from 0 to 2**63 - 1 ns; other times must not end the run."""
     points = np.ones((1, 3, 3), np.float32)
     late, negative = cloud(EPOCH, points), cloud(EPOCH, points)
     negative.header.stamp.sec = -5
@@ -458,7 +458,7 @@ def test_step_shorter_than_a_row_is_named(tmp_path: Path) -> None:
 
 
 def test_camera_of_distorted_images_is_fitted_to_their_rays(tmp_path: Path) -> None:
-    """The matrix of the calibration alone would be off by pixels at the border."""
+    """K alone, without the distortion, would be off by pixels at the border."""
     calibration = ("/depth/camera_info", 0, info(EPOCH, d=(0.12, 0, 0, 0, 0)))
     items = [calibration, ("/depth/image", 1, image(EPOCH, wavy_depth()))]
 
@@ -521,7 +521,7 @@ def test_invalid_depth_is_zero(tmp_path: Path) -> None:
 
 
 def test_each_image_uses_calibration_of_its_time(tmp_path: Path) -> None:
-    """Zoom and reconfiguration change it; it may be recorded before or after the image."""
+    """Zoom and reconfiguration change the calibration; it may be recorded after its image."""
     other, last = (Camera(64, 48, f, f, 30.0, 20.0) for f in (99.0, 77.0))
     depth = wavy_depth()
     items = [
@@ -596,7 +596,7 @@ def test_mismatched_calibration_is_counted_with_its_topic(tmp_path: Path) -> Non
 def test_intrinsics_of_another_resolution_cause_warning(
     tmp_path: Path, center: tuple[float, float], cropped: bool, warned: bool
 ) -> None:
-    """Objects would be sheared and of the wrong size; in a crop the centre may lie anywhere."""
+    """Objects would be sheared and of the wrong size; a crop may have any principal point."""
     calibration = info(EPOCH, replace(CAMERA, cx=center[0], cy=center[1]))
     if cropped:
         calibration.roi.width, calibration.roi.height = 64, 48
@@ -791,7 +791,7 @@ def test_error_names_why_no_stream_is_usable(tmp_path: Path) -> None:
 
 
 def test_clouds_of_changing_size_keep_their_sizes(tmp_path: Path) -> None:
-    """A camera for the whole image also reprojects the points of a cropped one."""
+    """A camera fitted to a whole cloud also fits a crop of it, but has another image size."""
     points = organized_points(wavy_depth())
     sizes = [(48, 64), (36, 64), (36, 50)]
     items = [("/points", k, cloud(EPOCH + k, points[:h, :w])) for k, (h, w) in enumerate(sizes)]
@@ -841,7 +841,7 @@ def test_damaged_compressed_depth_is_error_or_finite(data: bytes, pack: Any, at:
 
 
 def test_realsense_viewer_recording_uses_its_depth_unit(tmp_path: Path) -> None:
-    """It has other topic names, mono16 depth, and a depth unit for each sensor."""
+    """The viewer writes other topic names, mono16 depth, and a depth unit for each sensor."""
     depth = wavy_depth()
     sensor = "/device_0/sensor_1"
     unit, other = (make("std_msgs/msg/Float32", metres) for metres in (0.00025, 0.001))
@@ -912,7 +912,7 @@ def test_image_is_returned_as_soon_as_its_calibration_arrives(tmp_path: Path) ->
 def test_compressed_depth_that_cannot_be_right_is_refused(
     body: bytes, kind: str, reason: str
 ) -> None:
-    """It would be depth at wrong distances, or rows of another image."""
+    """Decoded anyway, it would give wrong distances, or rows that are not in the image."""
     whole = png(np.arange(500, 515, dtype=np.uint16).reshape(5, 3))
     at = whole.index(b"IHDR") + 4
     message = compressed(0, b"", kind)
@@ -923,7 +923,7 @@ def test_compressed_depth_that_cannot_be_right_is_refused(
 
 
 def test_damaged_pixels_of_compressed_depth_are_refused() -> None:
-    """The pixels after the damage would be depth at any distance."""
+    """The pixels after the damage would have arbitrary depths."""
     body = bytearray(png(wavy_depth()))
     body[body.index(b"IDAT") + 100] ^= 16
 

@@ -61,7 +61,7 @@ def test_calibration_is_found_beside_topic_without_slash(tmp_path: Path, lead: s
 
 
 def test_calibration_below_the_topic_of_its_images_is_found(tmp_path: Path) -> None:
-    """AirSim and MultiSense publish it there: depth and colour, in one frame, had none."""
+    """AirSim and MultiSense publish it there; their depth and colour had no calibration."""
     items = depth_in("/sim/front/DepthPlanar", "front")
     items[0] = ("/sim/front/DepthPlanar/camera_info", *items[0][1:])
     items += in_frame([("/sim/front/Scene/camera_info", EPOCH, info(EPOCH))], "front")
@@ -77,7 +77,7 @@ def test_calibration_below_the_topic_of_its_images_is_found(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("colour_info", ["camera_info", "color_camera_info"])
 def test_calibration_with_the_word_of_its_images_is_found(tmp_path: Path, colour_info: str) -> None:
-    """Depth silently got the intrinsics of the colour camera beside it, or none."""
+    """depth_camera_info belongs to depth_image, which silently got colour intrinsics, or none."""
     items = depth_in("/head/depth_image", "optical")
     items[0] = ("/head/depth_camera_info", *items[0][1:])
     items += depth_in("/head/aligned_depth_to_color/image", "optical")[1:]
@@ -107,7 +107,7 @@ def test_calibration_of_the_same_frame_is_found(tmp_path: Path) -> None:
 
 
 def test_calibrations_of_any_name_are_found_by_their_frames(tmp_path: Path) -> None:
-    """Foxglove has no convention for the names of their topics."""
+    """Foxglove has no convention for the names of calibration topics."""
     items = depth_in("/cam/depth/image", "depth")
     items[0] = ("/cam/depth/intrinsics", *items[0][1:])
     items += in_frame([("/cam/color/intrinsics", EPOCH, info(EPOCH))], "color")
@@ -135,7 +135,7 @@ def test_only_calibration_of_another_frame_causes_warning(tmp_path: Path) -> Non
 
 
 def test_slash_before_a_frame_does_not_make_it_another(tmp_path: Path) -> None:
-    """In ROS 1, some drivers write /camera in one topic and camera in the other."""
+    """In ROS 1, drivers may name a frame /camera in one topic and camera in another."""
     items = depth_and_info("/cam/depth/image_raw", "/cam/depth/info")
     in_frame(items[:1], "camera")
     in_frame(items[1:], "/camera")
@@ -149,7 +149,7 @@ def test_slash_before_a_frame_does_not_make_it_another(tmp_path: Path) -> None:
 def test_stream_with_calibration_of_another_camera_is_chosen_last(
     tmp_path: Path, other: str
 ) -> None:
-    """If only the calibration of the colour camera is recorded, the aligned depth or cloud fits."""
+    """If only colour has a calibration, depth aligned to colour, or a cloud, must be chosen."""
     items = depth_and_info("/cam/depth/image_rect_raw", "/cam/color/camera_info")
     in_frame(items[:1], "color")
     in_frame(items[1:], "depth")
@@ -165,7 +165,7 @@ def test_stream_with_calibration_of_another_camera_is_chosen_last(
 
 
 def test_confidence_map_is_not_taken_for_depth(tmp_path: Path) -> None:
-    """ZED cameras publish it as 32FC1 beside the depth, whose name says that it is registered."""
+    """ZED cameras publish confidence as 32FC1, like depth; objects would be meaningless."""
     zed = "/zed/zed_node"
     confidence, depth = f"{zed}/confidence/confidence_map", f"{zed}/depth/depth_registered"
     items = [
@@ -193,7 +193,7 @@ def test_other_measurements_are_not_taken_for_depth(tmp_path: Path, other: str) 
 
 @pytest.mark.parametrize("others", [(), ("/cam/points/xyz",)])
 def test_cloud_without_coordinates_is_chosen_last(tmp_path: Path, others: tuple[str, ...]) -> None:
-    """Zivid publishes normals alone, whose topic is the first by alphabet: no frame was usable."""
+    """Zivid has a topic of normals, first in the alphabet; chosen, it gave no usable frame."""
     normals = cloud(EPOCH, organized_points(wavy_depth()))
     for field in normals.fields:
         field.name = f"normal_{field.name}"
@@ -211,7 +211,7 @@ def test_cloud_without_coordinates_is_chosen_last(tmp_path: Path, others: tuple[
     ("topic", "radial"), [("distance", True), ("distance_to_image_plane", False)]
 )
 def test_distances_along_rays_are_chosen_last(tmp_path: Path, topic: str, *, radial: bool) -> None:
-    """Taken for depth they bend planes; ifm publishes a cloud of the same points beside them."""
+    """Distances taken for depth bend planes; ifm also publishes a cloud, which is better."""
     items = depth_in(f"/cam/{topic}", "camera")
     points = ("/cam/points", EPOCH, cloud(EPOCH, organized_points(wavy_depth())))
 
@@ -252,7 +252,7 @@ def test_depth_needs_no_particular_name(tmp_path: Path, topic: str) -> None:
     ],
 )
 def test_infrared_image_is_not_taken_for_depth(tmp_path: Path, topic: str) -> None:
-    """It has an encoding of depth, and images are preferred to the cloud beside them."""
+    """Infrared may have an encoding of depth, and images are preferred to clouds."""
     points = cloud(EPOCH, organized_points(wavy_depth()))
     items = [*depth_in(topic, "camera"), (f"{topic.rpartition('/')[0]}/points", EPOCH, points)]
     if topic.endswith("compressedDepth"):
@@ -282,7 +282,7 @@ def test_blank_first_image_does_not_hide_its_topic(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", [*(f"{e}; png compressed " for e in DEPTH_ENCODINGS), "png"])
 def test_depth_compressed_as_png_is_not_colour(tmp_path: Path, kind: str) -> None:
-    """The same frame id would put it before the images of the colour camera."""
+    """As it has the frame id of depth, it would be preferred to the actual colour images."""
     body = png(wavy_depth())
     items = [
         *depth_and_info("/cam/depth/image", "/cam/depth/camera_info"),
@@ -309,7 +309,7 @@ def test_depth_compressed_as_png_is_not_colour(tmp_path: Path, kind: str) -> Non
     ],
 )
 def test_depth_may_be_a_png_file(tmp_path: Path, topic: str, kind: str, *, known: bool) -> None:
-    """`compressed_image_transport` writes 16-bit depth as such, without loss."""
+    """`compressed_image_transport` writes 16-bit depth as PNG, without loss."""
     items = [
         ("/cam/camera_info", EPOCH, info(EPOCH)),
         (topic, EPOCH, packed(EPOCH, png(wavy_depth()), kind)),
@@ -326,7 +326,7 @@ def test_depth_may_be_a_png_file(tmp_path: Path, topic: str, kind: str, *, known
 
 
 def counting(monkeypatch: pytest.MonkeyPatch, module: Any, name: str) -> Counter[str]:
-    """Count the calls of a function under its name."""
+    """Count the calls of a function of ``module`` in the result, under its name."""
     calls = Counter[str]()
     function = getattr(module, name)
 
@@ -339,7 +339,7 @@ def counting(monkeypatch: pytest.MonkeyPatch, module: Any, name: str) -> Counter
 
 
 def test_streams_are_compared_in_pairs_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Comparing every colour with every two of 200 depth streams took minutes."""
+    """Comparing every colour with every pair of 200 depth streams took minutes."""
     count = 12
     streams = [
         Stream(f"/robot/cam{k}/depth/image", IMAGE, "depth", f"/info{k}", 1, f"depth{k}")
@@ -362,7 +362,7 @@ def test_streams_are_compared_in_pairs_only(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_sensor_that_shares_more_keeps_its_colour() -> None:
-    """The sensor of a stream may be the nearest or the second nearest to the images."""
+    """Colour images belong to the sensor whose topic name has the most parts in common."""
     left, right, far = (
         Stream(topic, IMAGE, "depth", "/info", 1, topic)
         for topic in ("/r/left/depth/image", "/r/right/depth/image", "/q/depth/image")
@@ -382,7 +382,7 @@ def test_sensor_that_shares_more_keeps_its_colour() -> None:
 def test_calibrations_of_any_name_are_read_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Reading all of them again for each image took minutes for 200 cameras."""
+    """Reading all calibrations again for each image topic took minutes for 200 cameras."""
     items: list[Item] = []
     for k in range(10):
         items += in_frame(depth_and_info(f"/images{k}", f"/calibration{k}"), f"camera{k}")
@@ -397,7 +397,7 @@ def test_calibrations_of_any_name_are_read_once(
 
 
 def in_frame(items: list[Item], frame_id: str) -> list[Item]:
-    """Return messages with another frame id."""
+    """Set the frame id of messages, in place, and return them."""
     for _, _, message in items:
         message.header.frame_id = frame_id
     return items
@@ -421,7 +421,7 @@ def depth_in(topic: str, frame_id: str) -> list[Item]:
 def test_cameras_with_similar_topics_are_several_sensors(
     tmp_path: Path, cameras: list[tuple[str, str]]
 ) -> None:
-    """The others would be left out without a word."""
+    """All cameras but one would be left out without a warning."""
     items = [item for topic, frame_id in cameras for item in depth_in(topic, frame_id)]
 
     with (
@@ -469,7 +469,7 @@ def test_many_sensors_cost_a_few_messages_each_and_one_line(
 
 
 def test_robots_of_one_kind_stay_apart_with_clouds(tmp_path: Path) -> None:
-    """The cloud of one robot has the frame of the other robot's images."""
+    """Both robots use the same frame ids; a cloud must not go to the other robot's sensor."""
     items: list[Item] = []
     for robot in ("/r1", "/r2"):
         points = cloud(EPOCH, organized_points(wavy_depth()))
@@ -509,7 +509,7 @@ def test_robots_of_one_kind_stay_apart_with_clouds(tmp_path: Path) -> None:
 def test_topics_of_one_camera_are_one_sensor(
     tmp_path: Path, cameras: list[tuple[str, str]], chosen: str
 ) -> None:
-    """The user would have to name a topic for a single camera."""
+    """Otherwise the user would have to choose a topic, although there is only one camera."""
     items = [item for topic, frame_id in cameras for item in depth_in(topic, frame_id)]
 
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:

@@ -49,7 +49,7 @@ OTHER = Camera(80, 60, 69.5, 73.5, 39.1, 30.3)
 
 @pytest.mark.parametrize("kind", ["64FC1", "16UC1; jpeg compressed "])
 def test_error_lists_encodings(tmp_path: Path, kind: str) -> None:
-    """Depth in another encoding was refused as if its topic held no image."""
+    """Depth in an unsupported encoding was refused as if its topic held no image."""
     topic, message = "/cam/depth/image", packed(EPOCH, jpeg(gradient()), kind)
     if kind == "64FC1":
         message = image(EPOCH, np.ones((3, 4)), kind)
@@ -75,7 +75,7 @@ def test_error_lists_encodings(tmp_path: Path, kind: str) -> None:
 
 
 def test_error_says_why_images_cannot_be_decoded(tmp_path: Path) -> None:
-    """Some converters store incomplete definitions; their messages only counted as unreadable."""
+    """Some converters store incomplete definitions; users did not learn why nothing is readable."""
     path, topic = tmp_path / "a.mcap", "/cam/depth/image"
     with mcap_writer(path) as writer:
         schema = writer.register_schema(
@@ -92,7 +92,7 @@ def test_error_says_why_images_cannot_be_decoded(tmp_path: Path) -> None:
 
 
 def test_error_about_a_truncated_recording_says_so(tmp_path: Path) -> None:
-    """It listed the topic of the depth images among the topics of a recording without any."""
+    """The error listed a depth topic, yet said that there is no depth, and gave no reason."""
     topic = "/cam/depth/image_raw"
     empty = [(topic, "sensor_msgs/msg/Image")]
     path = record(tmp_path / "a.mcap", depth_items(EPOCH), chunk_size=1, empty=empty)
@@ -183,7 +183,7 @@ def test_unrelated_colour_camera_is_used_only_if_single(tmp_path: Path) -> None:
 def test_single_colour_camera_is_not_used_for_two_sensors(
     tmp_path: Path, topic: str, frame_id: str, found: str | None
 ) -> None:
-    """Masks of one depth camera would be drawn on the view of the other."""
+    """The camera may belong to either; masks of the other would be drawn on the wrong view."""
     second = (topic, EPOCH, image(EPOCH, wavy_depth(), frame_id=frame_id))
     items = [*depth_items(EPOCH), second, *colour("/one/image")]
     with open_recording(record(tmp_path / "a.mcap", in_order(items))) as recording:
@@ -301,7 +301,7 @@ def test_colour_is_registered_only_if_cameras_are_equal(
 def test_distorted_colour_is_not_registered_to_rectified_depth(
     tmp_path: Path, k1: float, frame_id: str, *, registered: bool
 ) -> None:
-    """OAK cameras rectify the depth aligned to their colour camera, but not its images."""
+    """OAK cameras rectify depth aligned to colour, but not the colour images: masks were off."""
     items = depth_items(EPOCH)
     calibration = info(EPOCH, DEPTH, (k1, 0, 0, 0, 0))
     items.append(("/cam/color/camera_info", EPOCH, calibration))
@@ -318,7 +318,7 @@ def test_distorted_colour_is_not_registered_to_rectified_depth(
 
 @pytest.mark.parametrize("same", [True, False])
 def test_images_without_frame_ids_need_equal_calibrations(tmp_path: Path, *, same: bool) -> None:
-    """Masks would be off by the distance of the two cameras."""
+    """Masks would be off by the distance between the two cameras."""
     items = depth_items(EPOCH, frame_id="")
     items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, DEPTH if same else WIDE)))
     colours = gradient() if same else gradient(60, 80)
@@ -331,7 +331,7 @@ def test_images_without_frame_ids_need_equal_calibrations(tmp_path: Path, *, sam
 
 @pytest.mark.parametrize("k1", [0.0, 0.4])
 def test_warning_says_why_points_have_no_masks(tmp_path: Path, k1: float) -> None:
-    """Depth of a lens with strong distortion, as from an Azure Kinect, becomes loose points."""
+    """Strongly distorted depth, as from an Azure Kinect, becomes points without pixels."""
     items = depth_items(EPOCH)
     items[0][2].d = np.array([k1, 0, 0, 0, 0])
     items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)))
@@ -382,7 +382,7 @@ def test_librealsense_recording_gives_colour_pose(tmp_path: Path) -> None:
         found = pair_colours(recording, [stream]).get(stream.topic)
         assert found is not None
         pose = Extrinsics(recording, stream, found).colour_from_depth("0", "0", EPOCH, EPOCH)
-    ((_, view),), _ = read(path)  # whose frame ids are equal
+    ((_, view),), _ = read(path)  # here the frame ids are equal
 
     depth_turn, colour_turn = (Rotation.from_quat(turns[name]) for name in ("Depth_0", "Color_0"))
     assert pose is not None
@@ -460,7 +460,7 @@ def test_camera_still_fits_points_within_its_fit_error() -> None:
 
 
 def test_compressed_image_may_have_short_padding_at_end() -> None:
-    """An end marker far before the end is one of a preview."""
+    """An end marker far before the end is that of an embedded preview, not of the image."""
     for body in (jpeg(gradient()), png(gradient())):
         assert compressed_size(body + bytes(4000))[1:] == (64, 48)
         with pytest.raises(MessageError, match="truncated"):
@@ -470,7 +470,7 @@ def test_compressed_image_may_have_short_padding_at_end() -> None:
 
 
 def test_incomplete_blocks_of_pixels_are_black() -> None:
-    """Blocks of 2 by 2 pixels share a colour; a remainder shifts nothing."""
+    """Pixels left over at the border of the blocks must not shift the other pixels."""
     mosaic = np.full((5, 7), 90, np.uint8)
     found = pixels_of(ColourImage("", 0, 0, "", "bayer_rggb8", 7, 5, 7, mosaic.tobytes()))
     assert (found[:4, :6] == 90).all()
@@ -483,7 +483,7 @@ def test_incomplete_blocks_of_pixels_are_black() -> None:
 
 
 def test_raw_image_must_reach_its_last_pixel() -> None:
-    """Rows are padded, but the last one need not be."""
+    """Rows may be padded, but the padding of the last row may be missing."""
     data = np.arange(60, dtype=np.uint8).tobytes()
     for step, size in ((8, 8 * 2 + 6), (6, 18), (0, 18)):
         found = ColourImage("", 0, 0, "", "bgr8", 2, 3, step, data[:size])
@@ -578,7 +578,7 @@ def test_slerp_agrees_with_scipy() -> None:
 
 
 def test_transform_is_extrapolated_only_within_tolerance() -> None:
-    """Of equal samples the middle one is dropped, which must not change a result."""
+    """Of equal samples, those in the middle are dropped, which must not change results."""
     buffer = TransformBuffer()
     for ms, x in ((1000, 1.0), (2000, 2.0), (3000, 2.0), (4000, 2.0), (5000, 5.0)):
         assert buffer.add("map", "cup", ms * MS, ((x, 0, 0), (0, 0, 0, 1)), static=False)
@@ -625,7 +625,7 @@ def test_accelerations_are_averaged_over_half_a_second_each_way() -> None:
 
 
 def test_bag_record_must_end_within_its_chunk() -> None:
-    """A record is a header and data, each after its length."""
+    """A record that claims more than the chunk holds must be an error, not be read past its end."""
     header = struct.pack("<I", 4) + b"op=\x02"
 
     def entry(data: bytes) -> bytes:
@@ -670,7 +670,7 @@ def mcap_of(path: Path) -> Path:
 
 
 def bag_of(path: Path) -> Path:
-    """Write the times of `mcap_of`, two messages in most chunks."""
+    """Write the messages of `mcap_of` to a bag, two in most chunks."""
     store = get_typestore(Stores.ROS1_NOETIC)
     writer = BagWriter(path)
     writer.chunk_threshold = 60
@@ -763,7 +763,7 @@ def test_description_has_times_sizes_and_uses_of_topics(tmp_path: Path) -> None:
 
 
 def test_description_names_all_depth_streams_of_a_colour_camera(tmp_path: Path) -> None:
-    """All but the last one seemed to have no colour."""
+    """All depth streams but one seemed to have no colour."""
     aligned = "/cam/aligned_depth_to_color/image_raw"
     items = [*depth_items(EPOCH), (aligned, EPOCH, image(EPOCH, wavy_depth(), frame_id="color"))]
     items.append(("/cam/color/image_raw", EPOCH, raw(EPOCH, gradient(), "rgb8", "color")))
@@ -774,7 +774,7 @@ def test_description_names_all_depth_streams_of_a_colour_camera(tmp_path: Path) 
 
 
 def test_description_marks_depth_stream_without_calibration(tmp_path: Path) -> None:
-    """`process` refuses it, which `info` must foretell."""
+    """`process` refuses such a stream, so `info` must say it beforehand."""
     images = [item for item in depth_items(EPOCH) if not item[0].endswith("camera_info")]
     path = record(tmp_path / "a.mcap", images)
 

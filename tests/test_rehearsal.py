@@ -30,7 +30,7 @@ KERNELS = [
 
 
 def test_rehearsals_call_rarely_used_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A kernel that they miss is compiled in the first run, or in every run in a container."""
+    """A kernel that no rehearsal calls delays the first run or, in a container, every run."""
     called = set()
 
     def watch(module: ModuleType, name: str) -> None:
@@ -52,13 +52,14 @@ def test_rehearsals_call_rarely_used_kernels(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def mark(path: Path) -> None:
-    """Record a call in a file."""
+    """Append an x to a file."""
     with path.open("a") as file:
         file.write("x")
 
 
 @pytest.fixture
 def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Replace each compilation by an x in the returned file."""
     path = tmp_path / "trace"
     monkeypatch.setattr(rehearsal, "_completion_marker", lambda **_: tmp_path / "complete")
     monkeypatch.setattr(rehearsal, "_rehearse", lambda *_: mark(path))
@@ -78,7 +79,7 @@ def test_kernels_are_compiled_only_once(trace: Path) -> None:
 def test_kernels_for_colour_are_compiled_when_needed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without them, the first colour image takes ten seconds, and in a container each time."""
+    """Otherwise the first colour image takes ten seconds, in a container in every run."""
     calls: list[int] = []
     monkeypatch.setattr(
         rehearsal,
@@ -102,7 +103,7 @@ def test_kernels_for_colour_are_compiled_when_needed(
 def test_compiling_survives_removal_of_its_folder(
     trace: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """An update during a batch must not fail the remaining recordings."""
+    """An update during a batch removes the folder; the remaining recordings must not fail."""
     monkeypatch.setattr(
         rehearsal, "_completion_marker", lambda **_: tmp_path / "removed" / "complete"
     )
@@ -152,7 +153,7 @@ def test_compiling_reports_its_progress(
 
 
 def test_kernels_are_counted_every_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A line for each tenth of a second would bury all others."""
+    """A line for each tenth of a second would bury all other output."""
     now, reports = 100.0, list[tuple[str, int, int | None]]()
     monkeypatch.setattr("shapecat.rehearsal.time.monotonic", lambda: now)
     monkeypatch.setattr(rehearsal, "_count", lambda: int(now))

@@ -105,7 +105,7 @@ def results(url: str) -> set[str]:
 def test_recordings_of_server_are_processed_into_folder(
     shapecat: Run, address: str, served: Path, tmp_path: Path
 ) -> None:
-    """A signed URL has a query, which is not part of a name, nor of the printed one."""
+    """The query of a signed URL must be neither in the name of the run nor in the output."""
     names = ("a.mcap", "b.bag?signature=4/2.mcap", "broken.mcap", "missing.mcap")
     urls = [f"{address}/{name}" for name in names]
     done = shapecat("process", *urls, "--out", tmp_path / "out", *OPTIONS)
@@ -127,7 +127,7 @@ def test_recordings_of_server_are_processed_into_folder(
 def test_page_without_links_is_an_empty_folder(
     shapecat: Run, address: str, served: Path, tmp_path: Path
 ) -> None:
-    """It ended the command with a traceback."""
+    """Such a page ended the command with a traceback."""
     (served / "empty").mkdir()
     done = shapecat("process", f"{address}/empty/", "--out", tmp_path, *OPTIONS)
     (served / "empty").rmdir()
@@ -139,7 +139,7 @@ def test_page_without_links_is_an_empty_folder(
 def test_names_on_server_are_decoded(
     shapecat: Run, address: str, served: Path, tmp_path: Path
 ) -> None:
-    """Results were named ``my%20lab``, and a bag did not have the parts that its metadata names."""
+    """Results were named ``my%20lab``, and a bag lacked the parts that its metadata names."""
     (served / "my lab.mcap").symlink_to(served / "a.mcap")
     bag = record(served / "\xfc 1", FRAMES, container="ros2")
     urls = [f"{address}/my%20lab.mcap", f"{address}/%C3%BC%201"]
@@ -182,7 +182,7 @@ def test_folder_is_processed_into_storage_once(shapecat: Run, served: Path, out:
 def test_results_without_manifest_are_not_repeated(
     shapecat: Run, served: Path, bucket: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A killed command cannot send its last lines; the run folders must suffice."""
+    """A killed command cannot send the last lines of its manifest; the run folders must suffice."""
     for name in ("a.mcap", "b.bag"):
         (Location("s3://lab/again") / name).upload(served / name)
     command = ("process", "s3://lab/again/", "--out", "s3://lab/again/out", *OPTIONS)
@@ -216,7 +216,7 @@ def test_patterns_and_folders_of_storage_are_expanded(served: Path) -> None:
 def test_names_with_brackets_are_not_patterns(
     shapecat: Run, served: Path, tmp_path: Path, lab: str
 ) -> None:
-    """Otherwise its run folder looks empty, and a stranger's file in it is overwritten."""
+    """Otherwise a run folder with brackets looks empty, and files of others are overwritten."""
     names = ("take[1].mcap", "bag[2]/one.mcap", "bag[2]/metadata.yaml")
     for name in names[:2]:
         (Location(lab) / name).upload(served / "a.mcap")
@@ -241,7 +241,7 @@ def test_names_with_brackets_are_not_patterns(
 @pytest.mark.parametrize("place", ["memory://lab/mixed", "s3://lab/mixed"])
 @pytest.mark.usefixtures("bucket")
 def test_storage_is_searched_like_a_folder(place: str) -> None:
-    """Results of earlier runs are not recordings; a ROS 2 bag is a folder, and one recording."""
+    """Results of earlier runs are not recordings; the folder of a ROS 2 bag is one recording."""
     root = Location(place)
     for name in (
         *("x.mcap", "d/y.bag", "bag/bag_0.db3", "bag/bag_1.db3", "bag/metadata.yaml"),
@@ -265,7 +265,7 @@ def test_storage_is_searched_like_a_folder(place: str) -> None:
 
 
 def test_metadata_of_a_data_set_in_storage_makes_no_bag() -> None:
-    """As in a folder of this machine: its takes were mixed in one run."""
+    """The recordings of a data set with a metadata.yaml were mixed in one run."""
     names = {"set/walk.mcap", "set/run.mcap", "set/bag"}
     for name in ("set/walk.mcap", "set/run.mcap", "set/bag/x.mcap"):
         (Location("memory://takes") / name).write(name.encode())
@@ -283,7 +283,7 @@ def test_metadata_of_a_data_set_in_storage_makes_no_bag() -> None:
 @pytest.mark.parametrize("place", ["memory://unslashed", "s3://lab/unslashed"])
 @pytest.mark.usefixtures("bucket")
 def test_folder_at_url_is_searched_without_slash(place: str) -> None:
-    """It was downloaded whole, and its takes were mixed in one run."""
+    """Such a folder was downloaded whole, and its recordings were mixed in one run."""
     bag = f"{place}/in/bag"  # of a killed recorder: without metadata
     for name in ("a.mcap", "b.mcap", "bag/bag_0.mcap", "bag/bag_1.mcap", "old[1]/c.mcap"):
         (Location(f"{place}/in") / name).write(name.encode())
@@ -303,7 +303,7 @@ def test_folder_at_url_is_searched_without_slash(place: str) -> None:
 def test_url_without_recordings_is_named_beside_others(
     caplog: pytest.LogCaptureFixture, place: str
 ) -> None:
-    """As a missing file does, a misspelt one must fail: its recordings were just left out."""
+    """A misspelt URL must fail like a missing file; its recordings were silently left out."""
     for name in ("in/a.mcap", "notes/n.txt"):
         (Location(place) / name).write(b"something")
     missing = [f"{place}/on/", f"{place}/on/*.mcap"]
@@ -318,7 +318,7 @@ def test_url_without_recordings_is_named_beside_others(
 @pytest.mark.parametrize("place", ["memory://globbed", "s3://lab/globbed"])
 @pytest.mark.usefixtures("bucket")
 def test_pattern_at_url_finds_folders_as_a_shell_does(place: str) -> None:
-    """Bags that matched beside files were left out without a word."""
+    """If a pattern matched files and bags, the bags were left out without a warning."""
     for name in (
         *("in/a.mcap", "in/bag/bag_0.mcap", "in/bag/bag_1.mcap", "in/day[1]/b.bag", "in/n.txt"),
         *("in/done/annotated.mcap", "in/done/run.json", "in/.trash/c.mcap"),
@@ -365,7 +365,7 @@ def test_names_in_a_bucket_cannot_leave_the_folder(tmp_path: Path) -> None:
 
 
 def test_write_ahead_log_comes_with_its_database(tmp_path: Path) -> None:
-    """The last messages of a killed recorder are in it."""
+    """The last messages of a killed recorder are only in the log."""
     for name in ("a.db3", "a.db3-wal", "b.db3"):
         with fsspec.open(f"memory://logs/{name}", "wb") as file:
             file.write(name.encode())
@@ -404,7 +404,7 @@ def test_empty_objects_that_stand_for_folders_are_ignored(made: Path, tmp_path: 
 
 def answer(status: int) -> Exception:
     error = Exception("the storage says so")
-    error.status = status  # type: ignore[attr-defined]  # as aiohttp's have
+    error.status = status  # type: ignore[attr-defined]  # as in errors of aiohttp
     return error
 
 
@@ -423,7 +423,7 @@ def answer(status: int) -> Exception:
     ids=str,
 )
 def test_only_temporary_errors_are_retried(error: Exception, *, passes: bool) -> None:
-    """A busy server must not end a batch, and a wrong key must not delay one."""
+    """A busy server must not end a batch, and wrong credentials must not delay it."""
     assert storage._is_transient(error) is passes
 
 
@@ -440,7 +440,7 @@ def test_listings_are_read_in_pages(bucket: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture(scope="module")
 def made(served: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a run folder, made as a worker makes one in scratch."""
+    """Return a run folder as a worker writes it to scratch space."""
     folder = tmp_path_factory.mktemp("made") / "run"
     process_remote(Job(served / "a.mcap", folder, rrd=False), lambda *_: None, cores=1, batch="")
     return folder
@@ -449,9 +449,9 @@ def made(served: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_copy_of_recording_finds_its_results_at_the_url(
     shapecat: Run, made: Path, served: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A copy has another key than its original: the command failed, since no tables were there.
+    """A copy has another key than its original: the command failed instead of finding the run.
 
-    To find out costs a download, which must not be repeated.
+    To find the run costs a download, which must not be repeated.
     """
     url = "memory://copied/a"
     with claimed(url, "one") as claim:
@@ -469,7 +469,7 @@ def test_copy_of_recording_finds_its_results_at_the_url(
 def test_run_at_url_may_have_more_outputs_than_wanted(
     shapecat: Run, made: Path, served: Path
 ) -> None:
-    """As in a folder of this machine, where `--no-mcap` keeps a complete run."""
+    """With `--no-mcap`, a complete run must not be processed again, as in a local folder."""
     with claimed("memory://more/a", "one") as claim:
         upload(made, "memory://more/a", claim)
 
@@ -487,7 +487,7 @@ PLACES = ["memory://half/run", pytest.param("s3://lab/half/run", marks=pytest.ma
 def test_interrupted_upload_shows_no_run(
     made: Path, monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
-    """run.json must appear after all other files, and annotated.mcap not look like a recording."""
+    """run.json must appear after all other files, and annotated.mcap not count as a recording."""
     names = {path.name for path in made.iterdir()}
     sent = Location.upload
     for cut in range(len(names)):
@@ -562,7 +562,7 @@ def fail(*_: object, **__: object) -> None:
 def test_upload_removes_files_of_replaced_run(made: Path, tmp_path: Path, folder: str) -> None:
     """Masks or a report of earlier settings would contradict the new tables.
 
-    On a disk, the folder that keeps the replaced tables meanwhile must be made first.
+    On a disk, the folder that keeps the replaced tables meanwhile must be created first.
     """
     folder = folder.format(tmp_path)
     url, names = f"{folder}/run", {path.name for path in made.iterdir()}
@@ -577,7 +577,7 @@ def test_upload_removes_files_of_replaced_run(made: Path, tmp_path: Path, folder
 
 
 def test_labels_that_were_not_transferred_stay_at_the_url(made: Path, tmp_path: Path) -> None:
-    """They were left in the temporary folder."""
+    """The labels were left in scratch space, which is removed."""
     place, copy = Location("memory://kept/run"), "tracks.previous-3fa2b1c0.csv"
     shutil.copytree(made, tmp_path / "run")
     (tmp_path / "run" / copy).write_text("labels")
@@ -590,7 +590,7 @@ def test_labels_that_were_not_transferred_stay_at_the_url(made: Path, tmp_path: 
 
 
 def test_json_names_the_run_at_its_url(shapecat: Run, served: Path) -> None:
-    """It was the name alone, and without warnings if the run was complete before."""
+    """Runs had a name, but no URL, and runs that were already complete had no warnings."""
     out = ("--out", "memory://named", *OPTIONS, "--json", "--progress", "jsonl")
     command = ("process", served / "a.mcap", served / "b.bag", *out)
     first, again = shapecat(*command), shapecat(*command)
@@ -614,7 +614,7 @@ def test_unusable_run_at_url_is_named(shapecat: Run, served: Path, content: byte
 
 
 def test_run_of_another_version_at_url_can_be_overwritten(tmp_path: Path) -> None:
-    """Its labels could not be transferred, as it was refused even with --overwrite."""
+    """Such a run was refused even with --overwrite, so its labels could not be transferred."""
     url = "memory://earlier/run"
     run = run_info()
     del run["options"]["color"]
@@ -631,7 +631,7 @@ def test_run_of_another_version_at_url_can_be_overwritten(tmp_path: Path) -> Non
 def test_full_scratch_is_not_blamed_on_the_url(
     own_scratch: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A user of a bucket was told that it has no space left."""
+    """Users were told that the bucket has no space left."""
 
     def process(job: Job, *_: object, **__: object) -> None:
         with explained(f"{job.folder}: cannot write the results", OutputError):
@@ -672,7 +672,7 @@ def test_only_one_process_claims_a_folder(url: str, monkeypatch: pytest.MonkeyPa
 def test_claim_is_renewed_after_a_refused_heartbeat(
     monkeypatch: pytest.MonkeyPatch, request_: str
 ) -> None:
-    """After a short outage, another machine would do the same recording again."""
+    """After a short outage, another machine would process the same recording."""
     works, refusals, renewed = getattr(Location, request_), [OutputError("403")], threading.Event()
 
     def ask(self: Location, *content: bytes) -> Any:
@@ -703,7 +703,7 @@ def test_claim_that_cannot_be_removed_goes_stale(
 
 @pytest.mark.parametrize("content", [b"5", b"[" * 100_000])
 def test_damaged_claim_is_taken_over(monkeypatch: pytest.MonkeyPatch, content: bytes) -> None:
-    """Nobody renews it."""
+    """Nobody renews a damaged claim; it would keep its run from being processed."""
     monkeypatch.setattr(claims, "_STALE_S", 0.02)
     monkeypatch.setattr(claims, "_POLL_S", 0.01)
     (Location("memory://damaged-claims") / ".run.claim").write(content)
@@ -735,7 +735,7 @@ def test_claim_of_dead_process_is_taken_over(made: Path, bucket: Path) -> None:
 def test_upload_stops_when_claim_is_taken_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its run.json would complete a run with files of two processes."""
+    """The run.json of the first process would complete a run with files of two processes."""
     url, sent = "memory://taken/run", Location.upload
     made, followers = tmp_path / "run", list[claims.Claim]()
     made.mkdir()
@@ -793,7 +793,7 @@ def test_manifest_in_bucket_has_lines_of_all_writers() -> None:
 
 @pytest.mark.parametrize("last", ["failed", "complete"])
 def test_later_of_two_writers_decides(last: str) -> None:
-    """Their parts are read by name, whoever wrote last."""
+    """Parts of the manifest are read in order of their names, but the latest line must count."""
     url, times = f"memory://later-{last}", {last: "2026-01-01T12:00:05", "planned": "2026-01-01T12"}
     for writer, (state, time) in zip("ab", times.items(), strict=True):
         line = {"folder": "lab", "recording": "lab.mcap", "state": state, "time": time}
@@ -871,7 +871,7 @@ def peak_mb() -> float:
 @pytest.mark.usefixtures("bucket")
 @pytest.mark.parametrize("size", [0, 1, 9000 * 2**24, 9000 * 2**24 + 1, 5 * 2**40])
 def test_number_of_upload_parts_is_limited(size: int) -> None:
-    """Small parts would need more requests."""
+    """S3 accepts a limited number of parts, but small parts would need more requests."""
     part = Location("s3://lab/large")._in_parts(size)["chunksize"]
 
     assert part >= 16 * 2**20

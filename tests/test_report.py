@@ -81,7 +81,7 @@ def test_every_track_has_card_with_pictures(reported_run: Path) -> None:
 
 
 def test_page_loads_no_external_files(reported_run: Path) -> None:
-    """It must open on a robot without a network."""
+    """The page must open on a robot without a network."""
     text = (reported_run / "report.html").read_text("utf-8")
 
     assert not re.findall(r'(?:src|href)="(?!data:|#|\.\./)', text)
@@ -125,7 +125,7 @@ def test_page_shows_current_labels(run: Path, drawn: RunReport) -> None:
 def test_page_of_table_saved_by_spreadsheet_has_the_values_of_the_run(
     run: Path, drawn: RunReport
 ) -> None:
-    """A sorted table with fewer columns cost the order of the cards, and facts about tracks."""
+    """If a table was sorted, or lost columns, cards lost their order and facts about tracks."""
     whole = data_of(replace(drawn, folder=run).page())
     table = read_track_table(run / "tracks.csv")
     rows = sorted(table.rows, key=lambda row: row.track)
@@ -144,7 +144,7 @@ def test_page_of_table_saved_by_spreadsheet_has_the_values_of_the_run(
 
 
 def test_confidence_text_is_same_after_rounding_in_table() -> None:
-    """Cards show it beside the posterior, which is not rounded."""
+    """Cards show the confidence beside the unrounded posterior; the two must not differ."""
     for value in np.random.default_rng(0).uniform(0, 0.99, 2000).tolist():
         assert confidence_text(value) == confidence_text(float(f"{value:.3f}"))
         assert abs(float(confidence_text(value)) - value) < 0.0056
@@ -161,7 +161,7 @@ def test_plurals_and_time_spans_are_correct(reported_run: Path) -> None:
 
 
 def test_names_are_escaped_in_page(run: Path) -> None:
-    """Topics and categories may come from recordings and models of others."""
+    """Topics and categories come from files of others; scripts in them must not be executed."""
     evil = "</script><img src=x onerror=alert(1)>"
     info = json.loads((run / "run.json").read_text())
     info["warnings"] = [evil]
@@ -267,9 +267,9 @@ def test_damaged_run_does_not_prevent_pages_of_others(shapecat: Run, run: Path) 
 
 @pytest.mark.usefixtures("without_pictures")
 def test_index_names_recordings_that_failed(shapecat: Run, run: Path) -> None:
-    """A page of the runs alone looks as if the batch had been complete."""
+    """An index of finished runs alone looks as if the whole batch had succeeded."""
     states = [
-        ("table", "failed"),  # done since, by a command for it alone
+        ("table", "failed"),  # processed since, by a command of its own
         ("b", "planned"), ("b", "failed"), ("c", "failed"), ("c", "complete"),
         ("<a>", "failed"), ("d", "running"),
     ]  # fmt: skip
@@ -298,7 +298,7 @@ def test_index_names_recordings_that_failed(shapecat: Run, run: Path) -> None:
 def test_report_in_read_only_folder_names_a_remedy(
     shapecat: Run, run: Path, monkeypatch: pytest.MonkeyPatch, code: int, said: str
 ) -> None:
-    """Runs on a shared disk belong to others, and the page has its place in the run."""
+    """Runs on a shared disk may be read-only, and the page is written into the run folder."""
 
     def refuse(*_: Any) -> None:
         raise OSError(code, os.strerror(code))
@@ -480,7 +480,7 @@ def test_damaged_colour_image_is_replaced_by_depth() -> None:
 def test_unorganised_cloud_is_drawn_upright(
     right: Sequence[int], down: Sequence[int], away: Sequence[int]
 ) -> None:
-    """The axes of a lidar differ from those of a camera."""
+    """The axes of a lidar differ from those of a camera: its clouds would lie on their side."""
     x, y = np.random.default_rng(0).uniform(0, 1, (2, 60000))
     pole = abs(x - 0.5) < 0.05
     y[~pole] = 0.5 + 0.5 * y[~pole]  # a low wall with a pole
@@ -501,7 +501,7 @@ def test_unorganised_cloud_is_drawn_upright(
 
 
 def recorded(run: Path, seconds: float) -> np.ndarray:
-    """Return the colour image of a run at a time, as the Python interface gives it."""
+    """Return the colour image (h, w, 3) of a run nearest to a time, from the Python interface."""
     frames = list(open_run(run).frames())
     times = [(frame.stamp_ns - frames[0].stamp_ns) * 1e-9 for frame in frames]
     colour = frames[int(np.argmin(np.abs(np.subtract(times, seconds))))].color
@@ -629,7 +629,7 @@ def changes(browser: Browser) -> dict[int, str]:
 def test_new_page_keeps_corrections_not_downloaded(
     browser: Browser, run: Path, drawn: RunReport
 ) -> None:
-    """A label that was given elsewhere must cost no correction of another track."""
+    """If a label was given elsewhere, corrections of other tracks must not be lost."""
     reports = Reports([replace(drawn, folder=run)])
     (page,) = reports.write()
     a, b = (row.track for row in read_track_table(run / "tracks.csv").rows[:2])
@@ -647,7 +647,7 @@ def test_new_page_keeps_corrections_not_downloaded(
 def test_label_that_is_cleared_after_download_is_cleared_in_run(
     browser: Browser, reported_run: Path, tmp_path: Path
 ) -> None:
-    """The table seemed not to change the label that the first table had brought to the run."""
+    """A label that one downloaded table brought to the run was not cleared by the next."""
     run = tmp_path / "table"
     shutil.copytree(reported_run, run)
     page = run / "report.html"
@@ -655,7 +655,7 @@ def test_label_that_is_cleared_after_download_is_cleared_in_run(
     browser.open(page)
     for expected in ("delete", ""):
         for track in (a, b):
-            browser.click(f"#track-{track} button[data-label='delete']")  # the second clears it
+            browser.click(f"#track-{track} button[data-label='delete']")  # the second click clears
             browser.open(page)
         for _ in range(2):  # a table may also be lost
             browser.click("#download")
@@ -666,7 +666,7 @@ def test_label_that_is_cleared_after_download_is_cleared_in_run(
 
 
 def test_two_tabs_keep_corrections_of_both(browser: Browser, reported_run: Path) -> None:
-    """The last tab replaced what the other had kept, which was lost when both were closed."""
+    """Each tab overwrote the corrections of the other, which were lost when both were closed."""
     page = reported_run / "report.html"
     a, b, c = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:3])
     browser.open(page)
@@ -685,7 +685,7 @@ def test_two_tabs_keep_corrections_of_both(browser: Browser, reported_run: Path)
 
 
 def test_new_name_has_its_key_after_reload(browser: Browser, reported_run: Path) -> None:
-    """It was listed nowhere, so the next object had to be named again."""
+    """A new name was listed nowhere, so it had to be typed again for the next object."""
     page = reported_run / "report.html"
     a, b = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:2])
     browser.open(page)
@@ -701,7 +701,7 @@ def test_new_name_has_its_key_after_reload(browser: Browser, reported_run: Path)
 def test_label_that_begins_with_new_counts_under_its_category(
     browser: Browser, reported_run: Path
 ) -> None:
-    """A model that had learned *pan* was wrong wherever a person had written `new pan`."""
+    """A model that knows *pan* was counted as wrong where a person had written `new pan`."""
     a, b, c = read_track_table(reported_run / "tracks.csv").rows[:3]
     browser.open(reported_run / "report.html")
     for row, label in ((a, f"new {a.category}"), (b, "new pan"), (c, "pan")):
@@ -715,7 +715,7 @@ def test_label_that_begins_with_new_counts_under_its_category(
 
 
 def test_escape_leaves_label_as_it_was(browser: Browser, reported_run: Path) -> None:
-    """It gave the label typed so far, and an invalid one kept the focus."""
+    """Escape applied the text typed so far, and a field with an invalid label kept the focus."""
     a, b, c = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:3])
     browser.open(reported_run / "report.html")
     browser.click(f"#track-{a} button[data-label='delete']")
@@ -733,7 +733,7 @@ def test_escape_leaves_label_as_it_was(browser: Browser, reported_run: Path) -> 
 
 
 def test_focus_leaves_text_field_before_next_key(browser: Browser, reported_run: Path) -> None:
-    """It left a moment later: out of the text field that the next key had opened."""
+    """The focus left a moment later, and thus left the field that the next key had opened."""
     browser.open(reported_run / "report.html")
     track = read_track_table(reported_run / "tracks.csv").rows[0].track
     browser.run(
@@ -829,7 +829,7 @@ def test_page_and_annotate_accept_the_same_labels(
 def test_page_refuses_to_delete_a_track_that_others_are_merged_with(
     browser: Browser, reported_run: Path
 ) -> None:
-    """Keys and buttons give labels, too. The capital is of one who types the label."""
+    """Keys must be checked like typed labels, and typed labels in any case of letters."""
     page = reported_run / "report.html"
     a, b = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:2])
     browser.open(page)
@@ -989,7 +989,7 @@ def test_damaged_table_is_reported_by_name(
 
 
 def test_run_without_tracks_has_a_page(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its frames are shown nevertheless; how they are drawn does not matter here."""
+    """The frames are shown all the same; how they are drawn does not matter here."""
     monkeypatch.setattr(
         "shapecat.outputs.report.images._shaded",
         lambda frame, _window: np.zeros((*frame.depth.shape, 3), np.uint8),

@@ -1,4 +1,4 @@
-"""Tests that the pages of a report count alike, and as the corrected table says."""
+"""Tests that all pages of a report have the same counts, those of the corrected table."""
 
 import re
 from collections import Counter
@@ -31,7 +31,7 @@ def of_page(text: str) -> tuple[Tiles, dict[str, int]]:
 
 
 def counted(run: Path) -> tuple[int, int, Counter[str]]:
-    """Count the objects, uncertain tracks and categories in tracks.csv, as its labels say."""
+    """Count the objects, uncertain tracks and categories in tracks.csv, with its labels applied."""
     rows = {int(line["track"]): line for line in lines(run)}
     assert all(row["label"].count("merge") <= 1 for row in rows.values())
     kept = [r for r in rows.values() if r["label"] != "delete" and "merge" not in r["label"]]
@@ -64,7 +64,7 @@ def test_page_and_index_count_the_labelled_tracks(
 def test_counts_follow_corrections_on_the_page(
     browser: Browser, run: Path, drawn: RunReport, labelled: dict[int, str]
 ) -> None:
-    """They are those of a page that is made after the corrections, also after an undo."""
+    """Counts must equal those of a page written after the corrections, also after an undo."""
     reports = Reports([replace(drawn, folder=run)])
     (page,) = reports.write()
     script = """

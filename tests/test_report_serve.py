@@ -1,4 +1,4 @@
-"""Tests of the served report: labels are written at once, and only its owner can write them."""
+"""Tests of the served report: labels are written at once, and only the owner can write them."""
 
 import csv
 import http.client
@@ -63,7 +63,7 @@ def long_run(run: Path) -> Path:
 
 
 def without_recording(run: Path) -> Path:
-    """Point a run to a missing recording: its page is served sooner without pictures."""
+    """Point a run to a missing recording; without pictures, its page is served sooner."""
     info = json.loads((run / "run.json").read_text())
     info["input"]["path"] = str(run / "gone.mcap")
     (run / "run.json").write_text(json.dumps(info))
@@ -104,13 +104,13 @@ def order_of(browser: Browser) -> list[int]:
 
 
 def other_than(category: str, number: int) -> int:
-    """Return the digit of a category that is not this one."""
+    """Return the digit of another category than this; ``number`` varies the choice."""
     digit = 1 + number % len(NAMES)
     return digit if NAMES[digit - 1] != category else 1 + digit % len(NAMES)
 
 
 def test_keyboard_corrections_survive_restart_of_server(browser: Browser, long_run: Path) -> None:
-    """They are on disk when the page says so, before the server ends."""
+    """Corrections must be on disk when the page says so, not only when the server ends."""
     categories = {row.track: row.category for row in read_track_table(long_run / "tracks.csv").rows}
     wanted, keys = {}, []
     with serving(long_run) as (address, _):
@@ -147,7 +147,7 @@ def test_keyboard_corrections_survive_restart_of_server(browser: Browser, long_r
 def test_page_reports_corrections_lost_by_killed_server(
     browser: Browser, served: Callable[..., Server], long_run: Path
 ) -> None:
-    """Each correction is on disk, or the page reports it and offers it as a table."""
+    """Each correction must be on disk, or the page must report it and offer it in a table."""
     server = served(long_run)
     browser.open(server.address)
     order = order_of(browser)
@@ -173,7 +173,7 @@ def test_page_reports_corrections_lost_by_killed_server(
 def test_label_cleared_after_server_has_stopped_is_in_table(
     browser: Browser, long_run: Path
 ) -> None:
-    """The page offers the table to keep the correction, so the table must make it."""
+    """The page offers the table to keep the correction, so the table must contain it."""
     with serving(long_run) as (address, _):
         browser.open(address)
         track = order_of(browser)[0]
@@ -248,7 +248,7 @@ def ask(
 
 @contextmanager
 def serving(run: Path, drawn: RunReport | None = None) -> Iterator[tuple[str, str]]:
-    """Serve in this process; give the address of the page and that of its labels.
+    """Serve a run in this process; give the URL of its page, and the path of its labels.
 
     ``drawn`` is the report of a run with the same tables, if there is one.
     """
@@ -265,7 +265,7 @@ def correction(track: int, label: str, seen: str = "") -> str:
 def site(
     guessed_run: Path, drawn: RunReport, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Path, str, str]]:
-    """Serve a run that no test changes; return it and the addresses of page and labels."""
+    """Serve a run that no test changes; return it, its page's URL, and the path of its labels."""
     run = tmp_path_factory.mktemp("site") / "ta ble#2"
     shutil.copytree(guessed_run, run)
     with serving(run, drawn) as (address, labels):
@@ -292,7 +292,7 @@ FOREIGN_REQUESTS = {
 @pytest.mark.parametrize("stranger", FOREIGN_REQUESTS)
 @pytest.mark.parametrize("method", ["GET", "POST"])
 def test_outsiders_are_refused(site: tuple[Path, str, str], method: str, stranger: str) -> None:
-    """Any web page can send requests to this machine, also under its own host name."""
+    """Any web page can send requests to this machine, even under its own host name."""
     run, address, labels = site
     template, headers = FOREIGN_REQUESTS[stranger]
     target = labels if method == "POST" else urlsplit(address).path
@@ -314,7 +314,7 @@ def test_owner_is_served_under_both_host_names(site: tuple[Path, str, str]) -> N
         f"localhost:{port}",
         "localhost:9000",
         "localhost",
-    ):  # tunnels
+    ):  # the last two as through a tunnel
         for origin in ({}, {"Origin": f"http://{host}"}):
             assert ask(address, headers={"Host": host, **origin})[0] == 200
     assert json.loads(ask(address, path=labels)[1])["labels"]
@@ -339,7 +339,7 @@ def test_host_may_have_no_port(host: str, here: bool) -> None:
 
 
 def test_server_listens_on_one_address_only(site: tuple[Path, str, str]) -> None:
-    """A server on all addresses would answer on this one of the loopback network as well."""
+    """A server that listens on all addresses would answer on 127.0.0.2, too."""
     with socket.socket() as other, pytest.raises(ConnectionRefusedError):
         other.connect(("127.0.0.2", urlsplit(site[1]).port))
 
@@ -391,7 +391,7 @@ def test_correction_is_on_disk_before_confirmation(run: Path, drawn: RunReport) 
 
 
 def test_page_of_replaced_run_changes_nothing(run: Path, drawn: RunReport) -> None:
-    """Tracks of a run that was processed again have other numbers: an old page names others."""
+    """Tracks of a run that was processed again have other numbers: labels would be misplaced."""
     with serving(run, drawn) as (address, labels):
         text = (run / "run.json").read_text("utf-8")
         work = json.loads(text)["work"]
@@ -411,7 +411,7 @@ def test_page_of_replaced_run_changes_nothing(run: Path, drawn: RunReport) -> No
 def test_replaced_run_does_not_keep_other_pages_from_being_written(
     run: Path, drawn: RunReport
 ) -> None:
-    """A server that ends writes the corrections into all pages, whatever became of one run."""
+    """When a server ends, it must write all other pages, whatever became of one run."""
     gone = replace(drawn, folder=run.with_name("gone"))
     with pytest.raises(OutputError, match="gone"):
         Reports([gone, replace(drawn, folder=run)], indexed=True).write()
@@ -423,7 +423,7 @@ def test_replaced_run_does_not_keep_other_pages_from_being_written(
 
 
 def test_simultaneous_corrections_are_all_written(run: Path, drawn: RunReport) -> None:
-    """Each reads and writes the whole table: without a lock the last would undo the others."""
+    """Each correction rewrites the whole table: without a lock, one would undo another."""
     tracks = list(labels_on_disk(run))
     with serving(run, drawn) as (address, labels), serving(run, drawn) as (again, others):
         places = [(address, labels), (again, others)]
@@ -468,7 +468,7 @@ def test_two_tabs_do_not_overwrite_each_other(
         browser.turn_to(one)
         browser.click(f"#track-{third} [data-label='unknown']")
         browser.wait(SAVED)
-        browser.wait(f"{fix} === '→ delete'")  # the answer includes that of the other tab
+        browser.wait(f"{fix} === '→ delete'")  # the answer includes the labels of the other tab
     found = labels_on_disk(run)
     assert [found[track] for track in (first, second, third)] == ["delete", "unknown", "unknown"]
 
@@ -525,7 +525,7 @@ def test_taken_port_is_refused(shapecat: Run, long_run: Path) -> None:
 
 
 def test_keys_undo_move_and_open(browser: Browser, reported_run: Path) -> None:
-    """The same keys work in a page from a file."""
+    """Keys must also work in a page that is opened from a file, without a server."""
     browser.open(reported_run / "report.html")
     a, b, c = order_of(browser)[:3]
     ring = "return getComputedStyle(document.activeElement).outlineWidth"

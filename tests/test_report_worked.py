@@ -86,7 +86,7 @@ def worked_card() -> Card:
 
 
 def test_card_has_right_values() -> None:
-    """Bars show the last posterior, which is of all views. A track may coast at its end.
+    """Bars show the last posterior, of all views, even if the track coasts at its end.
 
     On the timeline, 300 wide and 4 s long, probability 0 is at y = 33 and 1 at y = 2.
     """
@@ -129,8 +129,8 @@ def test_card_has_right_values() -> None:
 def test_strip_boxes_have_right_positions(topics: tuple[str, str]) -> None:
     """Left and width are fractions of the width, top and height of the height.
 
-    Topics are named if there are several. Captions of frames less than 0.1 s apart differ, and say
-    what the colours mean.
+    Topics are named if there are several. Captions tell frames less than 0.1 s apart from each
+    other, and say if the picture is shaded depth.
     """
     boxes = {17: (50, 30, 20, 15), 99: (1, 2, 3, 4)}
     few = StripFrame("data:few", 200, 100, 0.52, topics[0], boxes)
@@ -347,7 +347,7 @@ def test_merged_tracks_count_once_in_index(run: Path) -> None:
 
 
 def test_detection_with_number_zero_is_a_view(run: Path) -> None:
-    """A row without a number is not."""
+    """Only a row without a detection number is no view; 0 must not be taken for none."""
     table = pq.read_table(run / "tracks.parquet")
     rows = table.to_pylist()
     rows[3]["detection"] = None
@@ -422,7 +422,7 @@ def test_strip_is_sorted_by_time(run: Path) -> None:
 
 
 def test_strip_frames_show_new_tracks_first() -> None:
-    """Of three frames, it shows that with most new tracks, else most tracks, else the middle."""
+    """Of 3 frames, it shows the one with most new tracks, else most tracks, else the middle one."""
     stamps = [(7_000_000_000 + 500_000_000 * k, ("/d", k)) for k in range(36)]
     tracks = {0: {1}, 1: {1, 2}, 3: {1, 2}, 5: {3}, 6: {1}, 7: {2}, 8: {3}, 9: {1, 2, 3}, 10: {1}}
     strip = choosing._strip(stamps, {("/d", k): seen for k, seen in tracks.items()})
@@ -461,7 +461,7 @@ def test_whole_views_are_preferred_to_larger_cut_ones(
 
 
 def test_the_largest_masks_of_a_track_are_not_shown() -> None:
-    """They often include a piece of the table; a cut view is not shown if a complete one exists."""
+    """The largest often include some table; each part of a track shows a complete view if any."""
     sizes = [500, 530, 2000, 510, 520, 540]
     views = [choosing._View(("/d", k), size, complete=True) for k, size in enumerate(4 * sizes)]
     cut = [choosing._View(("/d", k), 9000.0 + k, complete=False) for k in range(30, 40)]
@@ -516,7 +516,7 @@ def test_border_share_counts_sides_at_the_border() -> None:
 
 
 def test_only_clearly_nearer_neighbours_occlude() -> None:
-    """Of ten edges, the left ones are of the same surface, and the right ones of an occluder."""
+    """Of ten edges of the mask, the left ones border the same surface, the right an occluder."""
     depth = np.full((8, 9), 2.0, np.float32)
     depth[2:5, 3:5] = 1.0
     depth[2:5, 2] = 0.98  # within 15 mm and 1.5 % it may be noise or a slope
@@ -525,7 +525,8 @@ def test_only_clearly_nearer_neighbours_occlude() -> None:
     pixels = np.flatnonzero(depth == 1.0)
 
     assert _hidden_share(depth, pixels) == pytest.approx(3 / 10)
-    for columns, share in ((3, 3 / 10), (4, 0)):  # the occluder, then the object is at the border
+    # First the occluder is at the image border, then the object.
+    for columns, share in ((3, 3 / 10), (4, 0)):
         moved = np.roll(depth, columns, axis=1)
         found = _hidden_share(moved, np.flatnonzero(moved == 1.0))
         assert found == pytest.approx(share)
@@ -581,9 +582,9 @@ def thumbnails(
     labels: Mapping[int, TrackLabel],
     missing: Sequence[int] = (),
 ) -> list[tuple[int, tuple[int, ...]]]:
-    """Return the number and colour of each thumbnail of tracks with these categories.
+    """Return the number and RGB colour of the track of each thumbnail, as told by its picture.
 
-    Pictures are told apart by their widths. Those of the tracks in ``missing`` are missing.
+    ``found`` are category and confidence of the tracks; those in ``missing`` have no pictures.
     """
     line = Timeline(np.zeros(0), np.zeros(0, bool), np.zeros((0, 3)), (), np.zeros(3))
     cards = []
@@ -599,7 +600,7 @@ def thumbnails(
 
 
 def test_thumbnails_are_most_confident_of_each_category() -> None:
-    """The most confident of the others follow, up to six."""
+    """The most confident of the other tracks follow, up to six thumbnails."""
     found = [("cup", 0.6), ("can", 0.7), ("cup", 0.95), ("cup", 0.9), ("unknown", 0.3)]
     found += [("can", 0.8), ("cup", 0.5), ("cup", 0.4)]
     labels = {k: TrackLabel(k, *track) for k, track in enumerate(found)}
@@ -619,7 +620,7 @@ def test_thumbnails_show_what_labels_say() -> None:
     assert [colour for _, colour in shown[:2]] == [
         tuple(_palette(colour_of(name))[0][11]) for name in ("ball", "can")
     ]
-    assert [k for k, _ in thumbnails(found, labels, [3])] == [2, 4, 1]  # a picture of a part
+    assert [k for k, _ in thumbnails(found, labels, [3])] == [2, 4, 1]  # 2 is merged with it
 
 
 def test_strip_boxes_scale_with_their_images() -> None:

@@ -92,7 +92,7 @@ def test_changed_tracking_settings_give_tables_of_new_run(
     ids=["nothing", "detection", "seed", "every", "color", "up"],
 )
 def test_options_that_affect_frames_process_them_again(job: Job, change: dict[str, Any]) -> None:
-    """So does --overwrite without a change."""
+    """`--overwrite` without any change must process them again, too."""
     with pytest.raises(PerceivedError):
         pipeline.process(replace(job, **change))
 
@@ -166,7 +166,7 @@ def test_removed_output_is_written_again(job: Job) -> None:
 @pytest.mark.usefixtures("perceiving_fails")
 @pytest.mark.parametrize("gone", [True, False])
 def test_finished_run_follows_its_recording(job: Job, tmp_path: Path, *, gone: bool) -> None:
-    """Reports and exports would not find it, although the command had called it complete."""
+    """Reports and exports would not find a moved recording, although the run is complete."""
     first, moved = tmp_path / "first.mcap", tmp_path / "moved.mcap"
     shutil.copyfile(job.source, moved)
     if not gone:
@@ -185,7 +185,7 @@ def test_finished_run_follows_its_recording(job: Job, tmp_path: Path, *, gone: b
 
 @pytest.mark.usefixtures("perceiving_fails")
 def test_finished_run_that_a_kill_moved_away_is_complete(job: Job) -> None:
-    """It waits under a hidden name while it is replaced: hours of work would be done again."""
+    """A run has a hidden name while it is replaced; after a kill, hours of work were repeated."""
     known = read_run(job.folder)["id"]
     job.folder.rename(previous_path(job.folder))
 
@@ -200,7 +200,7 @@ def test_finished_run_that_a_kill_moved_away_is_complete(job: Job) -> None:
 def test_seconds_of_killed_run_count_once(
     job: Job, total: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A kill may come before or after the total is written, which includes the phases."""
+    """A kill may come before or after the total, which includes the phases, is written."""
     job = replace(job, settings=changed("tracking.gate_m=0.1"))
 
     def kill(*_args: Any) -> None:
@@ -225,7 +225,7 @@ def test_seconds_of_killed_run_count_once(
 def test_interrupted_run_keeps_its_frames_if_tracking_changes(
     job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They were perceived with the same settings; tracks, labels and outputs are made anew."""
+    """The frames were perceived with the same settings; only what follows must be done again."""
     half = replace(job, folder=tmp_path / "half", overwrite=False, rrd=False)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(pipeline, "annotate", interrupt)
@@ -270,7 +270,7 @@ def labels(folder: Path) -> set[str]:
 def test_labels_given_after_an_interruption_are_transferred(
     job: Job, monkeypatch: pytest.MonkeyPatch, later: str, kept: set[str]
 ) -> None:
-    """The replaced run is labelled until the new one is complete."""
+    """Users may label the replaced run until the new one is complete; no label may be lost."""
     job = replace(job, settings=changed("tracking.gate_m=0.1"), rrd=False, mcap=False)
     give_label(job.folder, "vase")
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
@@ -287,7 +287,7 @@ def test_labels_given_after_an_interruption_are_transferred(
 
 @pytest.mark.usefixtures("perceiving_fails")
 def test_unreadable_labels_are_reported_before_frames_are_perceived(job: Job) -> None:
-    """Hours later, the same command would only fail again."""
+    """Otherwise the command would fail only after hours, at its end."""
     (job.folder / "tracks.csv").write_text("")
 
     with pytest.raises(OutputError, match="no column"):
@@ -302,7 +302,7 @@ def interrupt(*_: Any, **__: Any) -> None:
 def test_labels_given_while_outputs_are_written_are_transferred(
     job: Job, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """That takes minutes in a long recording."""
+    """Writing outputs takes minutes; labels given meanwhile must not be lost."""
     job = replace(job, settings=changed("tracking.gate_m=0.1"), rrd=False)
     written, write = [], pipeline.annotate
 
@@ -324,7 +324,7 @@ def test_labels_given_while_outputs_are_written_are_transferred(
 def test_outputs_of_a_killed_annotation_are_written_as_it_was_asked_to(
     job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They would keep their old labels and boxes, and the run would look for a lost recording."""
+    """Otherwise they would have the old labels and boxes, and the old path of the recording."""
     moved, written = tmp_path / "moved.mcap", []
     shutil.copyfile(job.source, moved)
     give_label(job.folder, "vase")
@@ -351,7 +351,7 @@ def test_outputs_of_a_killed_annotation_are_written_as_it_was_asked_to(
 def test_segments_are_in_the_order_of_the_recording_on_any_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Some file systems list names by their digests: frames would go back and forth in time."""
+    """Some file systems list names by their hashes: frames would go back and forth in time."""
     for name in ("000032", "000000", "000016"):
         (tmp_path / name).mkdir()
     glob = Path.glob

@@ -64,7 +64,7 @@ def perceive(world: World, **settings: Any) -> list[Perception]:
 
 
 def detection_at(world: World, perceptions: Sequence[Perception], k: int, place: Any) -> Detection:
-    """Return the detection nearest to a place in the world."""
+    """Return the detection of frame ``k`` nearest to a place in the world."""
     found = perceptions[k].detections
     gaps = [np.linalg.norm(transform(world.path[k], d.candidate.box.center) - place) for d in found]
     assert min(gaps) < 0.08
@@ -132,7 +132,7 @@ def test_only_moved_object_is_described_again() -> None:
     assert detection_at(world, perceptions, CHANGE + 1, place + shift).reused_from == CHANGE
     others = [d.reused_from for d in perceptions[CHANGE].detections if d is not moved]
     assert others.count(0) >= len(others) - 1
-    # A repeat names the view that was described: one that names another would count twice.
+    # A repeat must name the view that was described: naming a repeat, it would count twice.
     assert perceptions[CHANGE + 1].reused_from == CHANGE
     again = [d.reused_from for d in perceptions[CHANGE + 1].detections]
     origins = [d.reused_from for d in perceptions[CHANGE].detections]
@@ -207,7 +207,7 @@ def placed(fixed_from_sensor: Pose, box: FullBox) -> tuple[Any, Rotation]:
 
 
 def test_reused_surfaces_and_boxes_stay_in_place_while_camera_moves() -> None:
-    """They stay exactly in place in the fixed frame."""
+    """Copied without a change, repeated surfaces and boxes would follow the camera."""
     world = make_scene("tabletop", np.random.default_rng(11), frames=FRAMES, rate_hz=30.0)
     perceptions = perceive(world)
     assert all(p.reused_from is None for p in perceptions)
@@ -235,7 +235,7 @@ def test_reused_surfaces_and_boxes_stay_in_place_while_camera_moves() -> None:
 
 @pytest.mark.parametrize(("pixels", "alike"), [(1350, True), (1400, False)])
 def test_nearer_view_with_flipped_yaw_is_alike_up_to_noise(pixels: int, *, alike: bool) -> None:
-    """Nearer by a factor of 0.951, as many pixels are 1.22 and 1.27 times those of before."""
+    """Reduced to the earlier distance, 1350 and 1400 pixels are 1.22 and 1.27 times 1000."""
     center, sights = np.array([0.1, -0.2, 1.0]), []
     half = np.sqrt(0.5)
     for share, count, sides, turn in (
@@ -276,7 +276,7 @@ def summary_of(
 
 
 def circled(*turn_deg: float) -> dict[str, Any]:
-    """Return the sensor turned about the object, which stays where it is in the image."""
+    """Return eye and look of a sensor turned about the object by a rotation vector, degrees."""
     turn = Rotation.from_rotvec(turn_deg, degrees=True)
     return {"eye": PLACE + turn.apply(EYE - PLACE), "look": turn * LOOK}
 
@@ -311,7 +311,7 @@ def test_views_are_alike_up_to_noise_in_the_fixed_frame(
 
 
 def test_views_of_another_kind_are_not_alike() -> None:
-    """Nor is one cut by the image border like a hidden one, or one without a pose like others."""
+    """A view cut by the border is unlike an occluded one; one without a pose is unlike others."""
     start: dict[str, Any] = {"eye": np.zeros(3), "look": Rotation.identity()}
     assert not _similar(summary_of(touches_border=True), summary_of(occluded=True))
     assert _similar(summary_of(**start, posed=False), summary_of(**start, posed=False))
@@ -353,7 +353,7 @@ def view_of_width(index: int, width: int) -> Any:
 
 
 ASIDE = 4 / KINECT.camera.fx
-"""A shift in metres, or a turn in radians, by which a thing 1 m away moves by 4 pixels."""
+"""A shift in metres, or a turn in radians, by which a point 1 m away moves by 4 pixels."""
 
 
 @pytest.mark.parametrize(
@@ -365,7 +365,7 @@ ASIDE = 4 / KINECT.camera.fx
     ],
 )
 def test_reused_surface_and_box_follow_a_shift_or_turn_alone(pose: Pose, moved_px: int) -> None:
-    """A camera on a rail never turns, and one that pans never moves: both change its view."""
+    """A camera on a rail only shifts, and one that pans only turns; each alone must count."""
     sights = []
     for k, (placed_at, left) in enumerate(((IDENTITY, 300), (pose, 300 - moved_px))):
         mask = np.zeros((480, 640), np.bool_)
@@ -401,7 +401,7 @@ def test_reused_surface_and_box_follow_a_shift_or_turn_alone(pose: Pose, moved_p
 
 
 def test_wrong_pose_prevents_reuse() -> None:
-    """A moving camera whose pose is constant sees other points."""
+    """If poses stay constant while the camera moves, other views' descriptions must not be used."""
     world = make_scene("tabletop", np.random.default_rng(11), frames=12, rate_hz=3.0)
     still = replace(world, path=(world.path[0],) * 12)
     guesser: Any = Guesser()

@@ -125,7 +125,7 @@ def test_few_frames_are_held_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def as_rows(batch: Any) -> list[dict[str, Any]]:
-    """Return the rows of a batch, times as nanoseconds: Python's have only microseconds."""
+    """Return the rows of a batch, times as nanoseconds: Python's times have only microseconds."""
     names = batch.schema.names
     if "sensor_time" in names:
         k = names.index("sensor_time")
@@ -230,18 +230,18 @@ def test_same_run_gives_same_content(tmp_path: Path) -> None:
 
 
 def test_reviews_in_one_process_leave_no_threads(tmp_path: Path) -> None:
-    """Rerun kept four threads and 3 MB of each: a batch of thousands ran out of both."""
+    """Rerun kept four threads and 3 MB for each review: a batch of thousands ran out of both."""
     threads = []
     for k in range(6):
         write(tmp_path / f"{k}.rrd", [scene(0, [labelled_object(1)])], name=f"lab{k}")
         threads.append(len(list(Path("/proc/self/task").iterdir())))
 
-    # They end a little later; four of each review would be 16 more.
+    # Threads end a little later; four of each review would be 16 more.
     assert threads[5] < threads[1] + 5, threads
 
 
 def test_recording_of_the_calling_program_stays_active(tmp_path: Path) -> None:
-    """It was ended without a word, so that what the program logged later was lost."""
+    """The program's own recording was ended, and what it logged later was lost."""
     rr.init("program")
     rr.save(tmp_path / "program.rrd")
     try:
@@ -264,7 +264,7 @@ def stores(path: Path, kind: str) -> list[tuple[str, str]]:
 
 
 def test_corrected_review_is_another_recording(tmp_path: Path) -> None:
-    """A viewer joins a file with the recording of its id, so that deleted tracks stayed."""
+    """A viewer merges recordings of the same id, so that deleted tracks stayed visible."""
     ids = set()
     for category in ("cup", "can"):
         path = write(tmp_path / category, [scene(0)], labels={1: TrackLabel(1, category, 1.0)})
@@ -320,7 +320,7 @@ def test_path_of_track_joins_centres_of_whole_object(tmp_path: Path) -> None:
 
 
 def test_path_leaves_out_frame_without_pose(tmp_path: Path) -> None:
-    """Its positions, known in the sensor frame alone, would be drawn at the origin of the map."""
+    """Its positions, known only in the sensor frame, would be drawn at the origin of the map."""
     pose = Pose(Rotation.from_euler("zyx", [0.3, 0.2, -0.7]).as_matrix(), np.array([0.5, 0.1, 1.3]))
     scenes = [
         scene(k, [labelled_object(1, x=0.2 * k)], pose=None if k == 1 else pose) for k in range(3)
@@ -345,7 +345,7 @@ def drawn_frames(scenes: Iterable[tuple[LabelledFrame, Frame]], *, fixed: bool) 
 
 
 def moving_camera(places: Iterable[float]) -> list[tuple[LabelledFrame, Frame]]:
-    """Return scenes of an object at given x in the fixed frame, by a camera that moves along x."""
+    """Return scenes of an object at given x in the fixed frame, seen by a camera moving along x."""
     poses = [Pose(np.eye(3), np.array([0.1 * k, 0, 0])) for k in range(9)]
     return [
         scene(k, [labelled_object(1, x=x - 0.1 * k)], pose=pose)
@@ -364,7 +364,7 @@ def test_recalibrated_camera_is_drawn_again(tmp_path: Path) -> None:
 
 
 def test_two_sensors_are_drawn_separately(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames of two cameras of one kind alternate; both begin without an object."""
+    """Frames of two equal cameras alternate; neither may replace what is drawn of the other."""
     views: list[tuple[str, str, Eye]] = []
 
     def lay_out(scenes: Any, *more: Any) -> Any:
@@ -396,7 +396,7 @@ def test_two_sensors_are_drawn_separately(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_counts_of_two_sensors_are_separate_lines(tmp_path: Path) -> None:
-    """In one line, the count jumped between those of the two sensors."""
+    """Drawn as one line, the count jumped between the two sensors."""
     topics, scenes = ("/left/depth", "/right/depth"), []
     for k in range(4):
         seen = [labelled_object(track) for track in range(1 + k % 2)]
@@ -439,7 +439,7 @@ def test_few_rows_or_numbers_are_held_back(rows: int, size: int) -> None:
 
 
 def test_large_images_and_masks_are_not_held_back() -> None:
-    """Counted as single rows, 256 of them would be in memory."""
+    """If each counted as one row, 256 of them would be held in memory."""
     sent: list[str] = []
     stream: Any = SimpleNamespace(
         log=lambda *_, **__: None, send_columns=lambda entity, *_: sent.append(entity)
@@ -452,13 +452,13 @@ def test_large_images_and_masks_are_not_held_back() -> None:
         images.add(scene(k, [labelled_object(4)])[0], coloured)
 
     name = rr.new_entity_path(["images", TOPIC])
-    assert sent == [name, f"{name}/masks"] * 2  # when two hold 512 kB
+    assert sent == [name, f"{name}/masks"] * 2  # whenever two hold 512 kB
 
 
 def test_rows_of_a_scene_count_as_what_they_hold(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Counted as single rows, 256 scenes with all their points would be in memory."""
+    """If each scene counted as one row, 256 with all their points would be held in memory."""
     sizes, add = {}, Columns.add
 
     def added(columns: Columns, entity: str, at: At, row: Any, *rest: Any, size: int = 1) -> None:
@@ -487,7 +487,7 @@ def test_label_has_only_low_confidences() -> None:
 
 
 def test_tabs_show_longest_tracks() -> None:
-    """Of hundreds of tracks most are short; tabs are in the order of their numbers."""
+    """Most of hundreds of tracks are short and need no tab; tabs are sorted by track number."""
     frames = {k: 300 if k % 2 else k for k in range(1, 101)}
     tracks = [TrackView(f"/tracks/{k}", f"#{k}", n) for k, n in frames.items()]
     titles = [str(view.name) for view in _track_tabs(tracks).contents]
@@ -576,7 +576,7 @@ def test_full_disk_while_writing_raises_error(tmp_path: Path) -> None:
 def test_review_whose_end_cannot_be_written_does_not_appear(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The last block is written after the last frame; the viewer would lack the layout."""
+    """If the disk is full at the very end, the review would lack its layout."""
     close, closed = ReviewFile.close, []
 
     def close_on_full_disk(file: ReviewFile) -> None:
@@ -646,7 +646,7 @@ def test_viewer_without_graphics_names_missing_package(
 def test_viewer_that_panics_is_not_taken_for_one_without_graphics(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without a window it has no font for a Japanese category; no package would have helped."""
+    """The viewer lacked a font for a Japanese category; the package named would not have helped."""
     fake = tmp_path / "rerun"
     (tmp_path / "log").write_text(
         "INFO re_renderer::context: wgpu adapter backend: Vulkan\n"
@@ -733,7 +733,7 @@ def test_screenshot_shows_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_eye_steps_back_to_show_all_objects_if_near() -> None:
-    """A moving camera leaves early objects behind, but a driving robot passes too many."""
+    """The eye must show objects that a camera has passed, but not all those of a long drive."""
     eye = Eye(np.array([0.0, -1.0, 1.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
     low, high = np.array([-1.0, -0.2, 0.0]), np.array([1.0, 0.2, 0.2])
 
@@ -771,7 +771,7 @@ def test_view_of_a_frame_without_objects_shows_what_there_is(kind: str) -> None:
 
 
 def test_view_has_measured_up_direction_even_without_planes() -> None:
-    """A camera that looks down would else show a slope."""
+    """Otherwise the scene of a camera that looks down would seem to lie on a slope."""
     labelled, frame = scene(0)
     labelled = dataclasses.replace(labelled, planes=(), up=np.array([0.1, -0.7, -0.7]))
     assert choose_eye(labelled, frame, fixed=False).up == pytest.approx([0.1, -0.7, -0.7])

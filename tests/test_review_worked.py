@@ -92,7 +92,7 @@ def contents(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def check(found: Any, expected: Any, name: str) -> None:
-    """Compare nested lists, whose lengths may differ."""
+    """Compare nested lists of any shape; numbers must agree to 1e-5."""
     if isinstance(expected, list | tuple | np.ndarray):
         assert len(found) == len(expected), name
         for one, other in zip(found, expected, strict=True):
@@ -104,7 +104,7 @@ def check(found: Any, expected: Any, name: str) -> None:
 
 
 def check_entity(found: dict[str, Any], kind: str, **expected: Any) -> None:
-    """Compare all columns of an archetype."""
+    """Compare all columns of an archetype, ``kind``; there must be no others."""
     columns = {name.partition(":")[2] for name in found if name.startswith(f"{kind}:")}
     assert columns == expected.keys()
     for name, value in expected.items():
@@ -136,7 +136,7 @@ def pixels() -> Any:
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory, pixels: Any) -> dict[str, dict[str, Any]]:
-    """Write two frames; only the first object is in both, and its full box only in the second."""
+    """Return `contents` of two frames; the first object is in both, its full box in the second."""
     first, second = items()
     path = tmp_path_factory.mktemp("review") / "review.rrd"
     frames = [seen_at(0, (replace(first, full=None),), pixels), seen_at(1, (first, second), pixels)]
@@ -259,7 +259,7 @@ def test_planes_have_their_outline_and_fill(shown: dict[str, Any]) -> None:
 
 
 def test_points_have_their_place_and_colour(shown: dict[str, Any], pixels: Any) -> None:
-    """Those of objects are tinted by 35 %; channels have 32 levels."""
+    """Points of objects are tinted by 35 %; channels have 32 levels."""
     owner = {index: k for k, one in enumerate(PIXELS) for index in one}
     rest = [index for index in range(47) if index not in owner]
     for name, chosen, z in (("scene", rest, 1.25), ("objects/points", sorted(owner), 0.875)):
@@ -335,9 +335,9 @@ def test_texts_are_those_of_run_and_last_event(shown: dict[str, Any]) -> None:
     ],
 )
 def test_cloud_without_fixed_frame(tmp_path: Path, up: Any, axes: list[int]) -> None:
-    """The z axis of a laser scanner is up, and y of a camera is down, also for its loose points.
+    """The z axis of a laser scanner is up, and y of a camera is down, also in unorganized clouds.
 
-    The scene is in the frame of the sensor, whose pose in another is not shown.
+    The scene is in the sensor frame; the pose of the sensor in another frame is not shown.
     """
     first, _ = items()
     first = replace(first, indices=np.array([1, 2]))

@@ -95,7 +95,7 @@ def test_unwritable_path_is_reported_with_reason(tmp_path: Path) -> None:
 
 
 def make_run(folder: Path, **files: str) -> Path:
-    """Make a run folder as an earlier run left it."""
+    """Make a run folder as an earlier run left it; ``files`` have _ for the dot in their name."""
     folder.mkdir(parents=True)
     run = run_info(id=new_id())
     write_run(folder, run)
@@ -126,7 +126,7 @@ def test_old_results_stay_until_new_ones_are_complete(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["lab", ".lab.partial"])
 @pytest.mark.parametrize("file", ["thesis.txt", "run.json", "tracks.csv"])
 def test_foreign_folder_is_not_touched(tmp_path: Path, name: str, file: str) -> None:
-    """Nor is one that looks like a run folder but has no id."""
+    """Not even a folder that looks like a run folder, but has no id, may be touched."""
     (tmp_path / name).mkdir()
     (tmp_path / name / file).write_text("{}")
     with pytest.raises(OutputError, match="did not make this"), staged(tmp_path / "lab"):
@@ -138,7 +138,7 @@ def test_foreign_folder_is_not_touched(tmp_path: Path, name: str, file: str) -> 
 
 @pytest.mark.parametrize("content", ['{"id": "0', '{"id": "0123456789abcdef"}'])
 def test_run_with_unusable_description_is_called_so(tmp_path: Path, content: str) -> None:
-    """The message said that shapecat did not make a folder which it made."""
+    """The message said that shapecat did not make a folder that it did make."""
     (tmp_path / "run.json").write_text(content)
     with pytest.raises(OutputError, match=r"its run\.json is damaged or from another version"):
         require_ours(tmp_path)
@@ -231,7 +231,7 @@ def test_recovery_removes_old_folder_but_keeps_user_files(tmp_path: Path) -> Non
 
 
 def test_recovery_keeps_old_results_beside_a_foreign_folder(tmp_path: Path) -> None:
-    """After a kill a person may have made a folder of that name; the results exist only once."""
+    """After a kill, a user may make a folder of that name; the only results must not be lost."""
     folder = tmp_path / "lab"
     make_run(previous_path(folder), tracks_csv="old")
     folder.mkdir()
@@ -289,7 +289,7 @@ def test_run_json_round_trips_and_is_validated(tmp_path: Path) -> None:
 
 
 def test_recording_at_url_is_missing_under_its_url(tmp_path: Path) -> None:
-    """It lost a slash. Several runs cannot be given their recordings in one command."""
+    """The URL lost a slash in the message, which must also name the command for this run."""
     url = "s3://lab/in/a.mcap"
     write_run(tmp_path, run_info(input={"path": url}))
 
@@ -317,7 +317,7 @@ def test_name_too_long_for_hidden_folder_is_explained(tmp_path: Path, length: in
 
 
 def test_longest_name_of_a_recording_is_read(tmp_path: Path) -> None:
-    """The name of its write-ahead log would be too long; asking for that was a traceback."""
+    """The name of its write-ahead log is too long for the disk; looking for it was a traceback."""
     path = tmp_path / ("n" * 250 + ".mcap")
     path.write_bytes(b"abc")
 
@@ -447,7 +447,7 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_scratch_that_may_be_in_use_is_not_removed(
     temporary: Path, monkeypatch: pytest.MonkeyPatch, case: str
 ) -> None:
-    """The recording would vanish while another command reads it.
+    """An unpacked recording would vanish while another command reads it.
 
     On NFS, a lock on a folder is known to its own machine only; and the name of a machine may begin
     with that of another.
@@ -470,9 +470,9 @@ def test_scratch_that_may_be_in_use_is_not_removed(
 
 
 def test_locks_leave_no_open_file(temporary: Path) -> None:
-    """A session that is refused, or fails, again and again would run out of files.
+    """A process whose locks are refused, or end in errors, again and again would run out of files.
 
-    One that fails would also keep the lock until its end.
+    After an error, it would also keep the lock until it ends.
     """
 
     def open_files() -> int:

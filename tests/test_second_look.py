@@ -42,11 +42,11 @@ COUNT = 40
 DISTURBED = (7, 16, 17, 31)
 MANY = tuple(range(3, COUNT, 4))
 SHORTLY, BRIEF = 25, tuple(range(20, 24))
-"""The label of an object that only a tenth of the frames show if ``brief``, and these frames."""
+"""The label of an object that only a tenth of the frames show if ``brief``, and their numbers."""
 BLOCKS = Settings(reuse_frames=4)
 """Shorter blocks than usual, so that several are perceived again."""
 LEANING = Pose(np.array([[1.0, 0, 0], [0, 0.28, -0.96], [0, 0.96, 0.28]]), np.zeros(3))
-"""The fixed frame of a log whose z is far from up."""
+"""Turns the fixed frame of a recording so that its z is far from up."""
 
 
 @cache
@@ -66,7 +66,7 @@ def views(moving: bool) -> tuple[tuple[Any, Any, Camera, Pose], ...]:
 
 
 def disturb(depth: Any, labels: Any) -> Any:
-    """Erase the depth of all furniture, and add a slanted board behind the top of the image."""
+    """Erase the depth of all furniture, and add a slanted board in the upper half of the image."""
     result = np.where(labels < 20, 0, depth).astype(np.float32)
     i, j = np.mgrid[:120, :160]
     slanted = (i < 60) & (labels < 20)
@@ -130,7 +130,7 @@ def share_found(out: Path, plain: Path) -> float:
 
 
 def assert_same_tracks(one: Path, other: Path, fixed: Pose = IDENTITY) -> None:
-    """Check that each object is one track in both runs, with equal category and position."""
+    """Check that both runs have equal tracks; ``fixed`` turns positions of ``one`` to ``other``."""
     tracks = lines(one), lines(other)
     assert len(tracks[0]) == len(tracks[1]) >= 5
     for a in tracks[0]:
@@ -166,7 +166,7 @@ def spoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_recording_with_tenth_of_frames_disturbed_loses_no_track(
     walk: Path, rest: Path, spoilt: Path, tmp_path: Path, *, moving: bool
 ) -> None:
-    """Both with a still camera without transforms and with a moving one with them."""
+    """A wrong up direction in some frames must not split tracks, with or without transforms."""
     plain, out = rest, spoilt
     if moving:
         messages = items(moving=True, disturbed=DISTURBED)
@@ -214,7 +214,7 @@ def test_consecutive_disturbed_frames_end_no_track(
 
 
 def test_up_of_tilted_fixed_frame_is_dropped(walk: Path, tmp_path: Path) -> None:
-    """Its poses are still correct, and the planes agree on an up direction in it."""
+    """Its z is not up, but its poses are right, and the planes agree on an up direction in it."""
     leaning = items(moving=True, fixed=LEANING, disturbed=DISTURBED)
     out = run(tmp_path / "leaning.mcap", leaning)
     about = read_run(out)
@@ -304,7 +304,7 @@ def test_kill_between_revised_tables_is_repaired(
 def tables(
     up: Any, *, given: Any = None, rotation: Any = None, offsets: Any = None, every: int = 1
 ) -> list[tuple[pa.Table, pa.Table]]:
-    """Return tables of one topic with a plane per frame, none where the offset is NaN.
+    """Return frames and planes of one topic, in two parts; no plane where the offset is NaN.
 
     ``every`` is the step between the numbers of the frames.
     """
@@ -329,7 +329,7 @@ def tables(
 
 
 def in_turn(one: Any, other: Any) -> list[tuple[pa.Table, pa.Table]]:
-    """Return tables with the frames of two cameras in turn, as they were recorded."""
+    """Return tables with the alternating frames of two cameras, as they were recorded."""
     return [
         tuple(
             pa.concat_tables([a, b.set_column(0, "topic", pa.array(["/e"] * len(b)))]).take(
@@ -342,7 +342,7 @@ def in_turn(one: Any, other: Any) -> list[tuple[pa.Table, pa.Table]]:
 
 
 def leaning(degrees: Any) -> Any:
-    """Return up (n, 3) of cameras with these angles below the horizontal."""
+    """Return up (n, 3) of cameras that look down by these angles, degrees."""
     angle = np.radians(degrees)
     return np.stack([0 * angle, -np.cos(angle), -np.sin(angle)], axis=1)
 
@@ -464,7 +464,7 @@ def test_poses_relate_up_directions_of_moving_camera() -> None:
 
 
 def test_frames_without_planes_do_not_decide_up_in_fixed_frame() -> None:
-    """They are most frames where the camera looks away from the table for long."""
+    """A camera that looks away for long gives a majority of frames with no plane and a wrong up."""
     truth, fixed_up = leaning(np.linspace(10, 70, 20)), np.array([0.6, 0.0, 0.8])
     rotation = [rotation_between(v, fixed_up) for v in truth]
     up, offsets = truth.copy(), np.full(20, -0.9)
@@ -526,7 +526,7 @@ def look_again(revisions: dict[Any, Revision]) -> list[Any]:
 
 @pytest.mark.usefixtures("read")
 def test_revised_frame_is_fused_with_the_frames_before_it() -> None:
-    """With other revised frames only, it would be noisier than the frames beside it."""
+    """Fused only with other revised frames, it would be noisier than its neighbours."""
     up = np.array([0, -1, 0], np.float32)
     inputs = [one for _, one in look_again({(TOPIC, k): Revision(up, None) for k in (5, 14)})]
 
@@ -536,7 +536,7 @@ def test_revised_frame_is_fused_with_the_frames_before_it() -> None:
 
 
 def test_revised_frame_keeps_its_pose_time_and_image(read: list[Any]) -> None:
-    """Its objects would leave their tracks, or lose their masks on the colour image."""
+    """Otherwise its objects would leave their tracks, or lose their masks on the colour image."""
     ups = np.eye(3, dtype=np.float32)
     chosen = {("/other", 8): Revision(ups[0], ups[1]), (TOPIC, 17): Revision(ups[2], None)}
 

@@ -28,7 +28,7 @@ def item(track: int, x: float, *, visible: float = 1.0, size: float = 0.1) -> di
 
 
 def figures_of(folder: Path, objects: list[dict[str, Any]], tracks: list[list[float]]) -> Any:
-    """Return the figures of ten equal frames; tracks are given by their x, row by row."""
+    """Return the figures of ten frames; ``tracks`` are the x of the tracks by frame, and repeat."""
     truth = [{"objects": objects, "hidden": []}] * 10
     (folder / "recording.truth.json").write_text(json.dumps(truth))
     rows = [

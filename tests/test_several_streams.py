@@ -58,7 +58,7 @@ def test_object_seen_by_two_sensors_is_one_track(shapecat: Run, tmp_path: Path) 
 
 @pytest.mark.parametrize("ahead_s", [0.5, 0.1])
 def test_clocks_that_differ_are_reported(tmp_path: Path, ahead_s: float) -> None:
-    """Two cameras at two computers: poses are looked up at the wrong time; nothing else says so."""
+    """If computers' clocks differ, poses are looked up at wrong times; nothing else reveals it."""
     scene = Scene(np.array([0, 0, 1], np.float32), (), ())
     with PerceptionTables(tmp_path, categories=("can",), model_id="m") as tables:
         for k in range(9):
@@ -74,7 +74,7 @@ def test_clocks_that_differ_are_reported(tmp_path: Path, ahead_s: float) -> None
 
 
 def test_without_fixed_frame_sensors_share_no_tracks(shapecat: Run, tmp_path: Path) -> None:
-    """Their coordinates are unrelated."""
+    """Their coordinates are unrelated: different objects would be merged."""
     recording = two_cameras(tmp_path / "a.mcap", transforms=False)
     options = ("--topic", DEPTH, "--topic", POINTS, "--no-rrd")
     assert shapecat("process", recording, "--out", tmp_path, *options).exit_code == 0

@@ -40,7 +40,7 @@ def big_quad(z: float) -> Mesh:
 
 
 def test_plane_that_extends_behind_the_camera_is_exact() -> None:
-    """A floor does, and must be clipped correctly."""
+    """The floor extends behind the camera; clipped wrongly, it would have wrong depth."""
     pose = looking_at(np.array([0, 0, 1.3]), np.array([0.2, 1.0, 0.9]))
     image = render(geometry([(big_quad(0.0), HERE)]), CAMERA, pose)
     fall = (rays(CAMERA) @ pose.rotation.T)[..., 2]
@@ -82,7 +82,7 @@ def test_shared_edges_leave_no_gap() -> None:
 
 
 def test_both_sides_of_triangles_are_rendered() -> None:
-    """Cups have thin walls, which the culling of back faces would open."""
+    """Back-face culling would make holes in the thin walls of cups."""
     quad = big_quad(1.0)
     back = Mesh(quad.vertices, quad.triangles[:, ::-1])
 
@@ -190,7 +190,7 @@ def test_kinect_disparity_is_quantized() -> None:
 
 @pytest.mark.parametrize("distance", [0.8, 1.6])
 def test_kinect_depth_noise_grows_with_squared_distance(distance: float) -> None:
-    """Its inverse depth has 0.0020 1/m in real frames (window of 40 pixels) at any distance."""
+    """Real frames have 0.0020 1/m of inverse depth (window of 40 pixels) at any distance."""
     sensor = dataclasses.replace(KINECT, fixed_error=0.0)
     depth, _ = measure(wall_image(sensor, distance), sensor, np.random.default_rng(0))
     inverse = 1 / depth[depth > 0].astype(np.float64)
@@ -233,7 +233,7 @@ def test_shadow_is_left_of_near_objects(sensor: Sensor, right: float) -> None:
 
 @pytest.mark.parametrize("name", ["d415", "d435", "d455", "sr300"])
 def test_stereo_noise_has_waves_as_wide_as_matching_windows(name: str) -> None:
-    """Voxels average finer noise, and surfaces would be flatter than real ones.
+    """Finer noise is averaged in voxels: surfaces would be flatter than real ones.
 
     Real cameras bend a plane in waves of 15 to 40 pixels, and hardly roughen it below 5.
     """
@@ -266,7 +266,7 @@ def test_stereo_depth_is_missing_around_near_surfaces() -> None:
 
 
 def small_box_from_above(height: float) -> Image:
-    """Return an image of a box on a plane 0.6 m away, 60 x 48 px, from straight above."""
+    """Return an image, from above, of a box of 60 x 48 px on a plane 0.6 m away."""
     box = rounded_box([0.0687, 0.055, height])  # 525 px at the distance of its top
     scale = (0.6 - height) / 0.6
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
@@ -312,7 +312,7 @@ def test_matching_windows_blend_small_steps_alone(height: float, wide: tuple[int
 
 
 def test_table_at_low_angle_has_no_missing_margins() -> None:
-    """Its inverse depth changes as much within a few pixels as at an outline."""
+    """Its inverse depth changes as much in a few pixels as at an outline, but it has none."""
     pose = looking_at(np.array([0, 0, 0.35]), np.array([0, 1.0, 0.2]))
     sensor = dataclasses.replace(PRESETS["d455"], holes=0.0, grazing_cosine=0.0, border_px=(0,) * 4)
     image = render(geometry([(big_quad(0.0), HERE)]), sensor.camera, pose)
@@ -333,7 +333,7 @@ def test_time_of_flight_noise_grows_with_distance(z: float) -> None:
 
 
 def test_stereo_holes_are_patches() -> None:
-    """Filters close holes of 3 pixels; those of a real stereo camera are as wide as its window."""
+    """Filters close 3-pixel holes, but holes of real stereo are as wide as a matching window."""
     sensor = dataclasses.replace(IDEAL, holes=0.01, hole_px=12)
     depth, _ = measure(wall_image(sensor, 1.0), sensor, np.random.default_rng(0))
     holes, count = label(depth == 0)
@@ -348,7 +348,7 @@ def test_stereo_holes_are_patches() -> None:
 def test_depth_at_grazing_incidence_is_missing_in_patches(hole_px: int, correlation: float) -> None:
     """Filters close single pixels: a table at a low angle would look intact.
 
-    At half the lag of the patches, the thresholds have a correlation of 1/2, their signs of 1/3.
+    At a lag of half a patch, the thresholds have a correlation of 1/2, and their signs of 1/3.
     """
     pose = looking_at(np.array([0, 0, 0.35]), np.array([0, 1.0, 0.2]))
     sensor = dataclasses.replace(IDEAL, grazing_cosine=0.2, hole_px=hole_px)

@@ -87,7 +87,7 @@ def test_convex_parts_cover_surface_and_leave_inside_open() -> None:
 
 
 def test_ball_dropped_into_cup_lies_in_it() -> None:
-    """The cup supports it, not the table."""
+    """The truth must name the cup as its support, not the table."""
     cup = lathe([[0, 0], [0.05, 0], [0.05, 0.1], [0.046, 0.1], [0.046, 0.005], [0, 0.005]])
     ball = make_ball(np.random.default_rng(1))
     ball = Mesh(ball.vertices * (0.05 / ball.extents.max()), ball.triangles)
@@ -198,7 +198,7 @@ def test_tilted_objects_are_marked() -> None:
 
 
 def test_truth_of_pile_has_support_relations(tmp_path: Path) -> None:
-    """They refer to listed tracks."""
+    """Support relations must refer to tracks that the truth lists."""
     path = record(settled("pile", 1), tmp_path / "pile.mcap", seed=1, sensor=KINECT)
     first, _ = json.loads(path.with_suffix(".truth.json").read_text("utf-8"))
     objects = {o["track"]: o for o in [*first["objects"], *first["hidden"]]}

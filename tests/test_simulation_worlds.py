@@ -37,7 +37,7 @@ KINDS: tuple[SceneKind, ...] = tuple(k for k in get_args(SceneKind) if k not in 
 
 
 def test_every_scene_is_a_kind() -> None:
-    """The tests below go through the kinds."""
+    """The tests below run only for the kinds that `SceneKind` lists."""
     assert set(get_args(SceneKind)) == SCENES.keys()
 
 
@@ -50,7 +50,7 @@ WORLDS = [
 def test_category_is_ambiguous_if_little_of_object_is_visible(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Few pixels are enough, and so is a small fraction of the side that faces the camera."""
+    """Either few visible pixels or a small visible fraction makes the category ambiguous."""
     world = make_scene("tabletop", np.random.default_rng(11), frames=1)
     _, labels = render_frame(world, 0, rng=np.random.default_rng(0), sensor=KINECT)
     clear = [
@@ -73,7 +73,7 @@ def test_category_is_ambiguous_if_little_of_object_is_visible(
 
 
 def test_truth_states_how_objects_stand() -> None:
-    """Categories, and results for lying or tilted objects, are judged by it."""
+    """Results are judged by these fields, and apart for lying or tilted objects."""
     names = (
         "label",
         "category",
@@ -249,7 +249,7 @@ def test_truth_lists_only_present_objects(tmp_path: Path) -> None:
 
 
 def test_carried_object_stands_on_nothing(tmp_path: Path) -> None:
-    """Support relations that are measured against the truth would be judged wrong."""
+    """Otherwise correct support relations would be judged wrong."""
     path = simulate(tmp_path / "a.mcap", scene="rearranged", frames=12, rate_hz=4, seed=5)
     truth = json.loads(path.with_name("a.truth.json").read_text())
     start = {
@@ -397,7 +397,7 @@ def test_true_planes_contain_their_points(recording: Path) -> None:
     for plane in truth["planes"]:
         own = frame.xyz()[labels.reshape(-1) == plane["label"]]
         offsets = own @ plane["normal"] - plane["offset"]
-        assert np.mean(np.abs(offsets) < 2e-3) > 0.9  # the others are on sides of the table
+        assert np.mean(np.abs(offsets) < 2e-3) > 0.9  # other points are on sides of the table
         place = transform(world.path[1], np.array(plane["normal"]) * plane["offset"])
         assert place[2] == pytest.approx(plane["height"], abs=1e-4)
 

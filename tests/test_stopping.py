@@ -87,7 +87,7 @@ class Command:
 def test_signal_keeps_finished_frames(
     recording: Path, undisturbed: Path, tmp_path: Path, signum: int, code: int, jobs: str
 ) -> None:
-    """It reaches the workers too: they must not die of it or print a traceback."""
+    """The signal also reaches the workers, which must neither die nor print a traceback."""
     command = Command(recording, tmp_path, "--jobs", jobs)
     command.wait_for_frames(BEGUN)
     command.signal_group(signum)
@@ -112,7 +112,7 @@ def test_termination_keeps_finished_frames(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A scheduler of jobs sends SIGTERM, to a command without other processes too."""
+    """Job schedulers send SIGTERM, also to a command without worker processes."""
     calls = count()
 
     def perceive(*given: Any) -> Any:
@@ -151,7 +151,7 @@ def test_time_before_interruption_counts_once(
     seconds: dict[str, float],
     least: int,
 ) -> None:
-    """Frames of a finished phase count as resumed."""
+    """The total would lack the earlier time, or have it twice; all frames count as resumed."""
 
     def fail(*_: object) -> None:
         raise stopping.Stopped(signal.SIGTERM)
@@ -193,7 +193,7 @@ def test_run_completes_if_progress_reader_leaves(recording: Path, tmp_path: Path
 def test_second_signal_ends_command(
     recording: Path, undisturbed: Path, tmp_path: Path, jobs: str
 ) -> None:
-    """At once: a command that finishes the frames in progress says how to continue."""
+    """It must end at once, not finish the frames in progress and then say how to continue."""
     command = Command(recording, tmp_path, "--jobs", jobs)
     command.wait_for_frames(BEGUN)
     command.signal_group(signal.SIGINT, signal.SIGTERM)
@@ -226,7 +226,7 @@ def test_signal_during_imports_ends_command_without_traceback() -> None:
 
 
 def test_message_of_a_failed_part_does_not_outlive_it(capfd: pytest.CaptureFixture[str]) -> None:
-    """The next part would be "stopping the server", and the next command would stop at once."""
+    """A later stop would be announced as "stopping the server", or a later command stop at once."""
     with pytest.raises(OSError, match="no disk"), stopping.stop_message("stopping the server"):
         with suppress(ValueError), stopping.stop_message("stopping the page"):
             raise ValueError
@@ -242,7 +242,7 @@ def test_message_of_a_failed_part_does_not_outlive_it(capfd: pytest.CaptureFixtu
 
 
 def test_command_in_another_thread_keeps_a_stop_request() -> None:
-    """If it forgot the request when it ends, the main thread would go on for hours."""
+    """If the command forgot the request at its end, the main thread would go on for hours."""
 
     def command() -> None:
         with stopping.handling_signals():

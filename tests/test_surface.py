@@ -195,7 +195,7 @@ def test_wrong_shapes_are_rejected() -> None:
 
 
 def test_small_separate_part_is_dropped_and_large_one_joined() -> None:
-    """Points of a neighbour in the mask, and an object divided by an occluder."""
+    """Small parts are points of a neighbour; an occluder may divide an object into large ones."""
     body = half_sphere(600)
     crumb = half_sphere(60, 0.01, seed=1) + np.float32(0.5)
     assert np.ptp(gas_of(np.concatenate([body, crumb])).neurons[:, 0]) < 0.2
@@ -324,7 +324,7 @@ def test_kernel_matches_published_algorithm() -> None:
 
 
 def test_distant_third_neighbour_is_not_linked() -> None:
-    """The third neighbour of two neurons that are apart from a row is across the gap."""
+    """The third neighbour of two isolated neurons is across a gap; only one edge may cross it."""
     row = np.stack([np.arange(8.0), np.zeros(8), np.zeros(8)], axis=1) / 10
     pair = np.array([[0.0, 0.9, 0.0], [0.1, 0.9, 0.0]])
     neurons = np.concatenate([row, pair]).astype(np.float32)

@@ -116,7 +116,7 @@ def test_tables_have_documented_columns(tmp_path: Path) -> None:
 
 
 def test_pixel_indices_are_delta_encoded(tmp_path: Path) -> None:
-    """They are most of a table: plain numbers would take ten times the space."""
+    """Pixel indices are most of a table; as plain numbers, they would take ten times the space."""
     write_run_tables(tmp_path, [2])
     group = pq.read_metadata(tmp_path / "detections.parquet").row_group(0)
     columns = [group.column(k) for k in range(group.num_columns)]
@@ -127,7 +127,7 @@ def test_pixel_indices_are_delta_encoded(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("empty", [0, 40, 150])
 def test_row_groups_of_all_tables_cover_same_frames(tmp_path: Path, empty: int) -> None:
-    """They are read side by side; frames without detections must not shift them."""
+    """Tables are read side by side; frames without detections must not shift their row groups."""
     counts = [0 if k < empty else k % 3 for k in range(150)]
     write_run_tables(tmp_path, counts)
     names = ("frames", "detections", "planes")
@@ -144,7 +144,7 @@ def test_row_groups_of_all_tables_cover_same_frames(tmp_path: Path, empty: int) 
 def test_segments_are_written_when_full_or_old(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A kill may cost two seconds of work; many quick frames would fill the memory sooner."""
+    """A kill may cost only two seconds of work, and many quick frames must not fill the memory."""
     clock = [7.0]
     place = "shapecat.runs.perceive.perceived"
     monkeypatch.setattr(f"{place}.time", SimpleNamespace(monotonic=lambda: clock[0]))
@@ -162,7 +162,7 @@ def test_segments_are_written_when_full_or_old(
 def test_long_run_stays_in_the_order_of_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
 ) -> None:
-    """A thousand segments take half an hour: exports and tracking would then fail."""
+    """After half an hour there are a thousand segments; out of order, exports would fail."""
     monkeypatch.setattr("shapecat.runs.perceive.perceived._SEGMENT_FRAMES", 1)
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1") as tables:
         for index in range(4):
@@ -282,7 +282,7 @@ def test_labelled_frames_join_tracks_and_labels(tmp_path: Path) -> None:
 
 
 def test_objects_of_two_sensors_are_kept_apart(tmp_path: Path) -> None:
-    """They share frame numbers: a sensor would get the tracks or masks of the other."""
+    """Two sensors share frame numbers: one would get the tracks or masks of the other."""
     counts = {("/a", 2): 2, ("/b", 2): 3, ("/a", 5): 1, ("/b", 5): 2}
     masked = {("/b", 2): {1: (3, 4, 7, 9)}, ("/a", 5): {0: (1, 2, 5, 6)}}
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1", colour=True) as tables:
@@ -357,7 +357,7 @@ def test_detections_keep_tracks_when_rows_are_read_in_parts(tmp_path: Path) -> N
     "change", [lambda rows: rows[1:], lambda rows: rows[::-1], lambda rows: rows[:0]]
 )
 def test_edited_detections_are_refused(tmp_path: Path, change: Callable[[Any], Any]) -> None:
-    """Boxes are found by their row: a filtered or sorted table gave tracks those of others."""
+    """Boxes are found by row: a filtered or sorted table gave tracks the boxes of others."""
     write_run_tables(tmp_path, [2, 1])
     write_tracks(tmp_path, [(5, 0, 0), (6, 0, 1)])
     path = tmp_path / "detections.parquet"
@@ -369,7 +369,7 @@ def test_edited_detections_are_refused(tmp_path: Path, change: Callable[[Any], A
 
 
 def test_track_of_missing_detection_is_refused(tmp_path: Path) -> None:
-    """It was a KeyError."""
+    """Such a track ended the command with a KeyError."""
     write_run_tables(tmp_path, [2])
     write_tracks(tmp_path, [(5, 0, 2)])
 
@@ -381,7 +381,7 @@ def test_track_of_missing_detection_is_refused(tmp_path: Path) -> None:
 
 
 def test_masks_of_missing_frame_are_refused(tmp_path: Path) -> None:
-    """It was a RuntimeError, and an export wrote all later frames without masks."""
+    """They ended in a RuntimeError, or an export wrote all later frames without masks."""
     write_run_tables(tmp_path, [1, 1])
     write_tracks(tmp_path, [(5, 0, 0)])
     masks = ImageMasks("/rgb", 1000, 2000, "c", 40, 30, {0: (3, 4, 7, 9)}, {0: np.array([7])})
@@ -442,7 +442,7 @@ def test_older_readers_open_tables_with_nulls(tmp_path: Path, name: str) -> None
 
 @pytest.mark.parametrize("name", TABLES)
 def test_changed_byte_in_any_column_is_found(tmp_path: Path, name: str) -> None:
-    """A disk error would move a box or change a label without a word, or end in a traceback."""
+    """A disk error would move a box or change a label silently, or end in a traceback."""
     path = tmp_path / f"{name}.parquet"
     schema = TABLES[name].with_metadata({"model": "m"})
     write_table(path, {field.name: [None] for field in schema}, schema)
@@ -495,7 +495,7 @@ def test_foreign_file_is_rejected_as_table(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("at_once", [1, 2, 3, 8])
 def test_chosen_rows_are_read_from_all_row_groups(tmp_path: Path, at_once: int) -> None:
-    """A row of another track, or of another object, would be shown."""
+    """Otherwise the row of another track, or of another object, would be shown."""
     path, sizes = tmp_path / "tracks.parquet", (7, 100, 1, 0, 50, 2)
     with open_writer(path, TRACKS) as writer:
         for first, size in zip(np.cumsum([0, *sizes]).tolist(), sizes, strict=False):
@@ -513,7 +513,7 @@ def test_chosen_rows_are_read_from_all_row_groups(tmp_path: Path, at_once: int) 
 
 @pytest.mark.parametrize("table", TABLES)
 def test_table_with_other_columns_is_rejected(tmp_path: Path, table: str) -> None:
-    """One of another version, or rewritten by a data frame library, gave a traceback later."""
+    """A table of another version, or rewritten by a data frame library, gave a traceback later."""
     path = tmp_path / f"{table}.parquet"
     empty = TABLES[table].empty_table()
     for k, field in enumerate(TABLES[table]):

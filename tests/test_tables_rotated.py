@@ -229,7 +229,7 @@ def test_tracker_reads_boxes_in_fixed_frame(run: Path) -> None:
 
 
 def test_tracker_reads_interleaved_topics_as_their_streams(tmp_path: Path) -> None:
-    """A detection in the frame of another topic, or row group, would be elsewhere."""
+    """A detection read into the frame of another topic, or row group, would be misplaced."""
     count = 2 * GROUP_FRAMES + 5
     wanted: dict[str, list[tuple[int, int, list[float]]]] = {"": [], "/own": []}
     written, row = [], 0
@@ -290,7 +290,7 @@ def test_view_with_either_flag_counts_as_partial(tmp_path: Path, flag: str) -> N
 
 
 def test_track_boxes_match_object_poses(run: Path) -> None:
-    """The fused box is around the outlines; of their variance, all six views share one half."""
+    """The fused box encloses the outlines; half of the variance is common to all six views."""
     tracks = rows(run, "tracks")
     # The standard deviation of a visible length is 6 mm, that of the height is given.
     std = np.array([0.006, 0.006, FULL_STD[2]]) * math.sqrt(1 / 2 + 1 / 12)
@@ -368,7 +368,7 @@ def test_cut_views_have_less_weight_for_full_box(tmp_path: Path, flag: str) -> N
 
 @pytest.mark.parametrize("posed", [3, 4])
 def test_pose_missing_in_half_of_frames_is_not_used(tmp_path: Path, posed: int) -> None:
-    """Detections without a pose would be lost; a few of them are."""
+    """Detections without a pose would be lost, which is accepted only if there are few."""
     own = np.array([0.31, -0.12, 0.94])
     one = detection_of(0, 1)
     box = replace(one.candidate.box, center=own)
@@ -454,7 +454,7 @@ def test_labelled_frames_and_annotations_have_same_boxes(run: Path, *, merged: b
 
 
 def test_annotation_of_unknown_whole_is_the_visible_part(tmp_path: Path) -> None:
-    """One such object must not cost the others of the frame their whole boxes."""
+    """One such object must not cost the other objects of the frame their whole boxes."""
     frames = []
     for k in range(FRAMES):
         first, vague, last = all_of(k)
@@ -561,7 +561,7 @@ def test_parts_of_merged_track_become_one_object(run: Path) -> None:
     for some in ([above, parts[1]], [parts[1], above]):
         assert _join(some, up.tolist()).height_m == pytest.approx(whole.height_m)
     hidden, cut = replace(parts[0], occluded=True), replace(parts[1], touches_border=True)
-    for some in ([hidden, cut], [cut, hidden]):  # a part that is not whole makes the object so
+    for some in ([hidden, cut], [cut, hidden]):  # a partial part makes the object partial
         joined = _join(some, up.tolist())
         assert (joined.occluded, joined.touches_border) == (True, True)
     assert not np.allclose(high.posterior, low.posterior)

@@ -80,7 +80,7 @@ def test_corrected_label_reaches_annotated_mcap_and_review(
 
 
 def plain_mcap(path: Path) -> bytes:
-    """Return all added messages of a recording."""
+    """Return the data of all messages that were added to a recording, joined."""
     from mcap.reader import make_reader  # noqa: PLC0415  beside its only use
 
     with path.open("rb") as file:

@@ -63,7 +63,7 @@ def test_fragment_beside_object_does_not_take_its_identity() -> None:
 
 
 def test_new_object_beside_missed_one_starts_new_track() -> None:
-    """Unlimited assignment would use the free row at any cost."""
+    """Unlimited assignment would give it to the track of the missed object at any cost."""
     tracker = Tracker(SETTINGS)
     for k in range(5):
         step(tracker, k, [[0, 0, 0], [1, 0, 0]])
@@ -172,7 +172,7 @@ def cameras(count: int, *, frames: int, apart: float) -> list[FrameDetections]:
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 def test_cameras_that_see_different_objects_are_no_scene_cuts(count: int) -> None:
-    """Neighbouring frames of a stream show nothing in common, if its cameras take turns."""
+    """If cameras take turns, consecutive frames show different objects without a scene cut."""
     frames = cameras(count, frames=30, apart=0.15)
     together = {frame.topic for frame in frames}
     (hits,) = gather(frames, together)
@@ -183,7 +183,7 @@ def test_cameras_that_see_different_objects_are_no_scene_cuts(count: int) -> Non
 
 
 def test_frames_of_fast_camera_do_not_end_tracks_of_slow_one() -> None:
-    """Each odd view of the camera with one image per second would get its own track."""
+    """Each deviating view of a camera with one image per second would get its own track."""
     fast = [frame(k, [0, 0, 0], topic="/fast") for k in range(200)]
     slow = [
         frame(k, [1, 0, 0], stamp_ns=k * SECOND + 7, posterior=BOX if k % 4 == 2 else CUP)
@@ -196,7 +196,7 @@ def test_frames_of_fast_camera_do_not_end_tracks_of_slow_one() -> None:
 
 @pytest.mark.parametrize("frames", [1, 2])
 def test_single_images_of_several_cameras_keep_every_detection(frames: int) -> None:
-    """Images of other cameras are no chance to see an object again."""
+    """Images of other cameras are no missed chance to confirm an object."""
     found = cameras(3, frames=frames, apart=0.6)
     tracks = track_frames(found, SETTINGS, together={frame.topic for frame in found})
 
@@ -218,7 +218,7 @@ def test_one_bad_frame_is_no_scene_cut() -> None:
 
 
 def test_one_of_two_objects_moved_is_no_scene_cut() -> None:
-    """At one image per second, the one that stayed would get a new track."""
+    """At one image per second, the object that stayed would get a new track."""
     places = [[[0, 0, 0], [0.4, 0, 0]]] * 5 + [[[0, 0, 0], [0.4, 0.2, 0]]] * 5
     frames = [frame(k, both, stamp_ns=k * SECOND) for k, both in enumerate(places)]
 
@@ -246,7 +246,7 @@ def test_objects_that_move_together_are_no_scene_cut(step_m: float) -> None:
 
 
 def test_unrelated_images_of_equal_objects_are_scene_cuts() -> None:
-    """Among many alike, some always seem to have moved together."""
+    """Among many equal objects, some always seem to have moved together."""
     random = np.random.default_rng(6)
     grid = np.array([[x, y, 0.0] for x in (0.0, 0.22, 0.44) for y in (0.0, 0.22)])
     frames = [
@@ -257,7 +257,7 @@ def test_unrelated_images_of_equal_objects_are_scene_cuts() -> None:
 
 
 def test_scene_cut_seen_by_two_cameras_is_one() -> None:
-    """The first image after it would be a scene of its own, in which each object is confirmed."""
+    """Counted twice, it would leave a scene of one image, in which any detection is confirmed."""
     frames = []
     for k in range(8):
         look: Any = {"posterior": CUP} if k < 4 else {"size": (0.3, 0.2, 0.04), "posterior": BOX}
@@ -331,11 +331,11 @@ def test_repeatedly_hidden_object_is_one_track() -> None:
         ({"posteriors": [[1, 0], [0, 1]]}, False),
         ({"scenes": [0, 1]}, False),
         ({"sizes": [[0.1, 0.1, 0.1], [0.2, 0.2, 0.1]], "whole": [3, 20]}, True),  # seen partially
-        ({"sizes": [[0.2, 0.2, 0.1], [0.1, 0.1, 0.1]], "whole": [3, 20]}, False),  # larger than it
+        ({"sizes": [[0.2, 0.2, 0.1], [0.1, 0.1, 0.1]], "whole": [3, 20]}, False),  # but larger
         ({"posteriors": [[1, 0], [0, 1]], "whole": [0, 20]}, True),  # partial views vary
         ({"posteriors": [[1, 0], [0, 1]], "novelties": [0.5, 1.2]}, True),  # so do unknowns
         ({"posteriors": [[1, 0], [0.3, 0.7]], "whole": [20, 3]}, True),  # at the same position
-        (  # somewhat larger than it
+        (  # but larger than the whole one
             {
                 "posteriors": [[1, 0], [0.3, 0.7]],
                 "whole": [20, 3],
@@ -498,7 +498,7 @@ def test_burst_of_splits_gets_no_track() -> None:
 
 
 def test_pieces_are_joined_after_hours(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Detections are compared in blocks; those of later ones must not be mistaken for the first."""
+    """Detections are compared in blocks; later blocks must not be mistaken for the first."""
     monkeypatch.setattr("shapecat.tracking.detection_table._BLOCK", 8)
     other = (1.0, 1.1)
     whole, split = [(0.0, 0.2), other], [(0.0, 0.08), (0.08, 0.2), other]
@@ -508,7 +508,7 @@ def test_pieces_are_joined_after_hours(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("before", [20, 2])
 def test_piece_that_stands_out_of_its_object_gets_no_track(before: int) -> None:
-    """Both pieces together are too large for the object, which encloses the piece's centre."""
+    """With the piece, the object would be too large, but it encloses the centre of the piece."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.2), (0.13, 0.25)]
     frames = boxed([whole] * before + [split] * 6 + [whole] * 20)
     assert [track.hits for track in track_frames(frames, SETTINGS)] == [before + 26]
@@ -542,7 +542,7 @@ def test_object_put_into_bowl_gets_own_track(count: int) -> None:
 
 
 def test_object_in_bowl_keeps_its_track_if_it_is_missed_once() -> None:
-    """One frame more in which the bowl covers its place must not discard all of its detections."""
+    """One more frame that shows only the bowl there must not discard all of its detections."""
     bowl, filled = [(0.0, 0.2)], [(0.0, 0.2), (0.1, 0.16)]
     frames = [bowl] * 30 + [filled] * 4 + [bowl] + [filled] * 4
     tracks = tuple(track_frames(boxed(frames), SETTINGS))
@@ -557,7 +557,7 @@ def test_object_in_bowl_whose_size_varies_keeps_its_track() -> None:
 
 
 def test_object_put_onto_plate_on_tray_gets_own_track() -> None:
-    """Plate and tray both enclose its place before, which is evidence from one side only."""
+    """Plate and tray enclosed its place only before it came; pieces are enclosed afterwards, too."""
     empty = [(0.0, 0.4), (0.08, 0.26)]
     tracks = track_frames(boxed([empty] * 30 + [[*empty, (0.1, 0.16)]] * 8), SETTINGS)
     assert sorted(track.hits for track in tracks) == [8, 38, 38]
@@ -642,7 +642,7 @@ def test_late_message_is_no_scene_cut() -> None:
 
 
 def test_late_messages_of_one_sensor_do_not_put_it_behind_the_other() -> None:
-    """All that it sees later would come after the end of the other's frames."""
+    """All its later frames would be placed after the last frame of the other sensor."""
     late = [*range(10), 12, 13, 10, 11, *range(14, 60)]
     frames = [
         frame(k, [0, 0, 0], stamp_ns=(s * SECOND + half) // 10, topic=topic)
@@ -686,7 +686,7 @@ def test_two_sensors_share_tracks_despite_clock_jump(single: bool) -> None:
 
 @pytest.mark.parametrize("per_s", [10, 2])
 def test_scraps_at_image_border_are_no_scene_cut(per_s: int) -> None:
-    """Of the last object in a camera that pans away, and of the first, only an edge is visible."""
+    """When a camera pans away or back, only an edge of the last or first object is visible."""
     whole, scrap = (0.08, 0.07, 0.07), (0.04, 0.02, 0.07)
     sizes = [whole] * 10 + [scrap] + [None] * 20 + [scrap] + [whole] * 10
     frames = [
@@ -758,7 +758,7 @@ def test_partial_view_changes_its_track_less() -> None:
 
 
 def test_posterior_after_each_view_uses_fusion_of_settings() -> None:
-    """The last one is that of the track, in the report and in the table."""
+    """The last posterior must be that of the track, in the report and in the table."""
     views = [np.array(view) for view in ((0.9, 0.1), (0.4, 0.6), (0.45, 0.55))]
     frames = [frame(k, [0, 0, 0], posterior=view) for k, view in enumerate(views)]
     (track,) = track_frames(frames, replace(SETTINGS, fusion="vote"))
@@ -823,7 +823,7 @@ def test_confirmed_track_ends_by_elapsed_time_alone(hits: int, alive: int) -> No
 
 @pytest.mark.parametrize("start_ns", [0, 1_700_200_000_000_000_000])
 def test_detection_of_two_frames_makes_no_track(start_ns: int) -> None:
-    """Whatever the clock, three frames must confirm noise, but all frames of a short recording."""
+    """By any clock, three frames confirm a track; in a recording of two frames, two are enough."""
     seen = [[[0.0, 0, 0], [0.5, 0, 0]] if k in {7, 8} else [[0.0, 0, 0]] for k in range(20)]
     frames = [
         frame(k, places, stamp_ns=start_ns + k * SECOND // 10) for k, places in enumerate(seen)

@@ -160,7 +160,7 @@ def frame_of(
 
 
 def table(random: np.random.Generator, n: int, *, spread: float = 0.35) -> list[Object]:
-    """Return objects at rest, at least a centimetre apart."""
+    """Return objects at rest, at least two centimetres apart."""
     objects: list[Object] = []
     places: list[F8] = []
     while len(objects) < n:

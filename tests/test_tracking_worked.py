@@ -122,7 +122,7 @@ def test_cost_of_pair_is_sum_of_differences() -> None:
 
 
 def test_size_key_ignores_quarter_turn() -> None:
-    """The two sides swap; the height does not, though it is between them."""
+    """The two sides swap; the height does not, though its length is between theirs."""
     expected = np.log([0.20, 0.06, 0.13])  # each a centimetre longer
 
     assert_allclose(size_key(np.array([[0.05, 0.19, 0.12], [0.19, 0.05, 0.12]])), [expected] * 2)
@@ -305,7 +305,7 @@ def turned_table() -> DetectionTable:
 
 
 def test_joint_box_encloses_corners_of_both_pieces() -> None:
-    """Along the axes of the first: longer side, shorter side, height."""
+    """The joint box has the axes of the first: longer side, shorter side, height."""
     hits = turned_table()
     signs = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
     axes = hits.axes(slice(None))

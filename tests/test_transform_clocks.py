@@ -24,9 +24,10 @@ TOPIC = "/camera/depth/image_raw"
 
 
 class Clocks(NamedTuple):
-    """Stamp and log time (ns) of frame ``k``, of images and of transforms, after `EPOCH`.
+    """Stamp and log time (ns) of frame ``k``, of its image and of its transforms.
 
-    ``later_s`` is added to the stamps of the transform from ``map`` to ``odom``, which then moves.
+    The frame ``moves`` moves in ``odom``. ``later_s`` is added to the stamps of the transform from
+    ``map`` to ``odom``, which then moves, too.
     """
 
     images: Callable[[int], tuple[int, int]]
@@ -116,7 +117,7 @@ def test_other_delays_are_no_different_clocks(name: str, tmp_path: Path) -> None
 
 
 def test_without_poses_clocks_do_not_matter(tmp_path: Path) -> None:
-    """The warning says how to process such a recording; then it must not return."""
+    """The warning says how to process such a recording, and must then not appear again."""
     clocks = Clocks(lambda k: at(k, 500), lambda k: at(k, late_ms=3))
 
     assert warnings(tmp_path, clocks, fixed_frame=OPTICAL) == []

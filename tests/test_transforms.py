@@ -78,7 +78,7 @@ def test_order_of_arrival_and_repeated_poses_do_not_matter() -> None:
 
 
 def test_lookup_resolves_nanoseconds() -> None:
-    """Seconds in a double resolve 238 ns."""
+    """Seconds since 1970 in a double resolve only 238 ns."""
     buffer = TransformBuffer()
     buffer.add("map", "base", EPOCH, moved(0.0), static=False)
     buffer.add("map", "base", EPOCH + 100, moved(1.0), static=False)
@@ -148,7 +148,7 @@ def published(
 
 @pytest.mark.parametrize("static", [False, True])
 def test_transform_is_unknown_within_a_gap(static: bool) -> None:
-    """Poses that were interpolated over 3 s were wrong by 10 cm; a placeholder is wrong as well."""
+    """Poses that were interpolated over 3 s were wrong by 10 cm; a static placeholder is, too."""
     buffer = published(
         [*range(0, 301, 100), *range(1700, 2200, 100)], lambda t: moved(t * 1e-4), static=static
     )
@@ -202,7 +202,7 @@ def test_gap_without_motion_is_bridged(pose: Any, known: bool) -> None:
 
 
 def test_equal_transforms_count_in_the_usual_interval() -> None:
-    """Samples dropped as equal count, too: else a robot at rest seems to publish only rarely."""
+    """Otherwise a robot at rest, whose equal samples are dropped, would seem to publish rarely."""
     times = [*range(0, 3000, 100), *range(5000, 8000, 100)]
     buffer = published(times, lambda t: moved(float(t >= 5000)))
 
@@ -316,7 +316,7 @@ def test_fixed_frame_follows_naming_convention(chain: list[str], expected: str |
     ],
 )
 def test_fixed_frame_is_not_that_of_another_robot(root: str, sensor: str, expected: str) -> None:
-    """Its corrections would move the tracks of this robot."""
+    """The corrections of the other robot's pose would move the tracks of this one."""
     buffer = TransformBuffer()
     for robot, odom in (("r1", "odom"), ("r2", "odom"), ("r3", "base_link")):
         buffer.add(root, f"{robot}/{odom}", 0, IDENTITY, static=True)
@@ -388,7 +388,7 @@ def stamped(parent: str, child: str, x: float, stamp: int) -> Any:
 
 
 def test_static_transforms_of_a_namespace_hold_at_all_times(tmp_path: Path) -> None:
-    """As moving ones, they would end when the next message is missing: no frame had a pose."""
+    """Read as moving transforms, they were valid only near their stamps: frames had no pose."""
     items = [("/robot1/tf_static", EPOCH, stamped("base", "camera", 0.3, EPOCH))]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         buffer = read_transforms(recording)
@@ -435,7 +435,7 @@ def test_mixed_up_poses_of_two_robots_are_reported(tmp_path: Path) -> None:
 
 
 def test_transforms_without_stamps_use_log_times(tmp_path: Path) -> None:
-    """Images and accelerations without stamps do as well, and would find no transform."""
+    """Images and accelerations without stamps use log times, too, and would find no transform."""
     items = [("/tf", EPOCH + k * SECOND, stamped("odom", "base", float(k), 0)) for k in range(3)]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         buffer = read_transforms(recording)

@@ -58,7 +58,7 @@ def depth_noise(points: F4, rng: np.random.Generator) -> F4:
 
 @pytest.mark.parametrize("invalid", [np.nan, 0.0], ids=["nan", "zero"])
 def test_camera_of_transformed_cloud_is_found(invalid: float) -> None:
-    """Drivers mark missing points by zeros, which transformed are the centre of the camera."""
+    """Some drivers mark missing points by zeros, which a transform moves to the camera's centre."""
     rng = np.random.default_rng(0)
     points = depth_noise(organized_points(wavy_depth()), rng)
     points[np.isnan(points)] = invalid
@@ -76,7 +76,7 @@ def test_camera_of_transformed_cloud_is_found(invalid: float) -> None:
 
 
 def test_clouds_with_damaged_numbers_are_read_without_warnings() -> None:
-    """NumPy would print its own between the messages of shapecat."""
+    """NumPy would print its own warnings between the messages of shapecat."""
     points = posed(organized_points(wavy_depth()))
     points.view(np.uint32)[::7, ::5] = 0x7F800001  # a signaling NaN
     points[3::7, ::5] = 3e38
@@ -217,7 +217,7 @@ def test_cloud_in_the_map_needs_no_transforms(tmp_path: Path) -> None:
 
 
 def test_colour_camera_is_placed_beside_the_camera_of_a_moved_cloud(tmp_path: Path) -> None:
-    """Transforms relate it to the frame that the cloud names: masks would lie elsewhere."""
+    """Transforms relate it to the frame of the cloud, not to its camera: masks would be off."""
     pose = Pose(rotation_from_quaternion((0.3, -0.6, 0.4, 0.5)), np.array([0.3, -1.2, 0.8]))
     beside = Pose(rotation_from_quaternion((0.1, 0.2, -0.1, 0.9)), np.array([0.05, -0.02, 0.01]))
     links = [("base_link", "color", compose(pose, beside))]

@@ -174,7 +174,7 @@ def test_separate_parts_are_linked_once_at_nearest_neurons() -> None:
 
 
 def test_stacked_object_is_described_relative_to_its_support() -> None:
-    """Relative to the table, it would begin too high, and its full box would include the other."""
+    """Relative to the table, it would begin too high, and its full box include the object below."""
     shapes = [table(), box((0, 0, 0), (0.22, 0.18, 0.08)), box((0, 0.01, 0.08), (0.1, 0.08, 0.1))]
     frame = frame_of(render(shapes)[0])
     guesser: Any = Guesser()
@@ -231,7 +231,7 @@ def test_grid_intrinsics_match_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
         k = grid.intrinsics
         ray = np.stack([(j - k.cx) / k.fx, (i - k.cy) / k.fy, np.ones(i.size)], axis=-1)
         off = grid.inverse_depth[i, j] - ray @ normal / offset
-        step = np.abs(normal[:2] / offset / [k.fx, k.fy]) / grid.factor / 2  # of half a pixel
+        step = np.abs(normal[:2] / offset / [k.fx, k.fy]) / grid.factor / 2  # for half a pixel
         assert grid.factor > 1
         assert abs(np.median(off)) < 0.1 * step.min()
 
