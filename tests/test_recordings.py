@@ -171,9 +171,9 @@ def test_warning_states_lost_bytes_of_unfinished_mcap(tmp_path: Path, rest: byte
 
 
 def test_chunk_without_messages_does_not_set_start(tmp_path: Path) -> None:
-    """The times of an empty chunk are 0: the recording would begin in 1970, `--end 5` read nothing.
+    """By the format, the times of an empty chunk are 0: the recording would begin in 1970.
 
-    Some writers begin with a chunk that holds only schemas and channels.
+    `--end 5` would then read nothing. Some writers begin with a chunk of schemas and channels.
     """
     path = tmp_path / "a.mcap"
     with mcap_writer(path, compression=CompressionType.NONE) as writer:

@@ -409,7 +409,7 @@ def test_damaged_images_are_skipped_and_reported(tmp_path: Path) -> None:
 
 
 def test_damaged_raw_images_are_skipped_and_reported(tmp_path: Path) -> None:
-    """Damaged images must not be counted as images of the run, and fail when they are shown."""
+    """Counted as images of the run, damaged images would fail only when they are shown."""
     stamps = [EPOCH + 100 * k * MS for k in range(4)]
     images = [raw(stamp, gradient(), "rgb8") for stamp in stamps]
     images[0].data = images[0].data[:100]
@@ -548,7 +548,7 @@ def test_colour_without_transform_is_unused(tmp_path: Path) -> None:
 
 
 def test_extrinsics_topic_without_messages_is_ignored(tmp_path: Path) -> None:
-    """A recording that starts after the driver lacks messages of this latched topic."""
+    """A recording that starts after the driver lacks its messages, and must still be processed."""
     declared = [("/cam/extrinsics/depth_to_color", "std_msgs/msg/String")]
     ((_, view),), warnings = read(paired(tmp_path / "a.mcap", empty=declared))
 

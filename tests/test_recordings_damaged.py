@@ -96,7 +96,7 @@ def test_index_without_checksum_is_compared_with_the_chunks(tmp_path: Path, dama
 def test_destroyed_messages_count_where_messages_are_chosen(
     tmp_path: Path, needed: set[int] | None, full: list[int], without_data: list[int]
 ) -> None:
-    """Frames are found again by number; it must not depend on which messages can be read."""
+    """Frames are found again by number, which must not depend on the messages that are read."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, chunk_size=120) as writer:
         channel = writer.register_channel("/a", "x-text", 0)
@@ -510,7 +510,7 @@ def test_damaged_message_of_a_database_is_skipped(tmp_path: Path, *, counted: bo
 
 
 def test_database_is_read_up_to_where_it_ends_too_early(tmp_path: Path) -> None:
-    """The first hour of a bag on a failing disk is still useful, if the user knows that it ends."""
+    """The first hour of a bag on a failing disk is useful; the user must learn where it ends."""
     path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
     with closing(sqlite3.connect(path)) as base:  # more than the library keeps in memory
         rows = [(10 * SECOND + k, text("x" * 3000)) for k in range(1500)]

@@ -484,7 +484,7 @@ def test_camera_of_distorted_images_is_fitted_to_their_rays(tmp_path: Path) -> N
 def test_truncated_or_empty_depth_image_is_counted_with_its_size(
     tmp_path: Path, height: int, kept: int, reason: str
 ) -> None:
-    """The size tells a driver's mistake from a cut message."""
+    """The size in the error tells a driver's mistake from a truncated message."""
     message = image(EPOCH, wavy_depth())
     message.height, message.data = height, message.data[:kept]
     items = [("/depth/camera_info", 0, info(EPOCH)), ("/depth/image", 1, message)]

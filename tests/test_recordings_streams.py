@@ -77,7 +77,7 @@ def test_calibration_below_the_topic_of_its_images_is_found(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("colour_info", ["camera_info", "color_camera_info"])
 def test_calibration_with_the_word_of_its_images_is_found(tmp_path: Path, colour_info: str) -> None:
-    """depth_camera_info belongs to depth_image, which silently got colour intrinsics, or none."""
+    """depth_image belongs to depth_camera_info, but silently got colour intrinsics, or none."""
     items = depth_in("/head/depth_image", "optical")
     items[0] = ("/head/depth_camera_info", *items[0][1:])
     items += depth_in("/head/aligned_depth_to_color/image", "optical")[1:]
@@ -184,7 +184,7 @@ def test_confidence_map_is_not_taken_for_depth(tmp_path: Path) -> None:
     "other", ["amplitude", "intensity/image_raw", "snr/image", "statemap", "texture"]
 )
 def test_other_measurements_are_not_taken_for_depth(tmp_path: Path, other: str) -> None:
-    """Drivers of ifm, SICK, Zivid and Photoneo encode them like the depth beside them."""
+    """Drivers of ifm, SICK, Zivid and Photoneo encode these like the depth of the same camera."""
     items = [*depth_in(f"/cam/{other}", "camera"), *depth_in("/cam/z", "camera")]
 
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:

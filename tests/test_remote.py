@@ -388,7 +388,7 @@ def test_bag_in_bucket_is_processed(shapecat: Run, bucket: Path, tmp_path: Path)
 
 @pytest.mark.usefixtures("bucket")
 def test_empty_objects_that_stand_for_folders_are_ignored(made: Path, tmp_path: Path) -> None:
-    """The web console of S3 makes them: a bag could not be downloaded, and a run not uploaded."""
+    """The web console of S3 makes them; bags could not be downloaded then, nor runs uploaded."""
     system: Any = fsspec.filesystem("s3")
     for key in ("marked/bag/", "marked/bag/sub/", "marked/out/run/"):
         system.call_s3("put_object", Bucket="lab", Key=key, Body=b"")

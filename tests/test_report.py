@@ -501,7 +501,7 @@ def test_unorganised_cloud_is_drawn_upright(
 
 
 def recorded(run: Path, seconds: float) -> np.ndarray:
-    """Return the colour image (h, w, 3) of a run nearest to a time, from the Python interface."""
+    """Return the recorded colour image (h, w, 3) nearest to a time, from the Python interface."""
     frames = list(open_run(run).frames())
     times = [(frame.stamp_ns - frames[0].stamp_ns) * 1e-9 for frame in frames]
     colour = frames[int(np.argmin(np.abs(np.subtract(times, seconds))))].color
@@ -572,7 +572,7 @@ def many_tracks(folder: Path, count: int) -> str:
 def test_corrections_made_in_browser_are_adopted(
     browser: Browser, shapecat: Run, run: Path, drawn: RunReport
 ) -> None:
-    """`annotate` reads the table that the page writes."""
+    """Corrections would be lost if `annotate` could not read the table that the page writes."""
     (page,) = Reports([replace(drawn, folder=run)]).write()
     rows = read_track_table(run / "tracks.csv").rows
     a, b, c, d, e = (row.track for row in rows[:5])
@@ -829,7 +829,7 @@ def test_page_and_annotate_accept_the_same_labels(
 def test_page_refuses_to_delete_a_track_that_others_are_merged_with(
     browser: Browser, reported_run: Path
 ) -> None:
-    """Keys must be checked like typed labels, and typed labels in any case of letters."""
+    """Labels given by keys must be checked like typed ones, and these in upper and lower case."""
     page = reported_run / "report.html"
     a, b = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:2])
     browser.open(page)
@@ -851,7 +851,7 @@ def test_page_refuses_to_delete_a_track_that_others_are_merged_with(
 
 
 def test_corrections_are_kept_for_one_run_only(run: Path, drawn: RunReport) -> None:
-    """Tracks of a run that was processed again have other numbers."""
+    """Tracks of a run processed again have other numbers: corrections would be misplaced."""
     work = drawn.work[:-1] + ("1" if drawn.work.endswith("0") else "0")
     keys = [data_of(replace(drawn, folder=run).page())["key"]]
     relabel(run, {read_track_table(run / "tracks.csv").rows[0].track: "teapot"})

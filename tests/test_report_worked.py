@@ -422,7 +422,7 @@ def test_strip_is_sorted_by_time(run: Path) -> None:
 
 
 def test_strip_frames_show_new_tracks_first() -> None:
-    """Of 3 frames, it shows the one with most new tracks, else most tracks, else the middle one."""
+    """Of every 3 frames, the strip has that with most new tracks, else most, else the middle."""
     stamps = [(7_000_000_000 + 500_000_000 * k, ("/d", k)) for k in range(36)]
     tracks = {0: {1}, 1: {1, 2}, 3: {1, 2}, 5: {3}, 6: {1}, 7: {2}, 8: {3}, 9: {1, 2, 3}, 10: {1}}
     strip = choosing._strip(stamps, {("/d", k): seen for k, seen in tracks.items()})
@@ -461,7 +461,7 @@ def test_whole_views_are_preferred_to_larger_cut_ones(
 
 
 def test_the_largest_masks_of_a_track_are_not_shown() -> None:
-    """The largest often include some table; each part of a track shows a complete view if any."""
+    """They often include some table; in each quarter of a track, complete views are preferred."""
     sizes = [500, 530, 2000, 510, 520, 540]
     views = [choosing._View(("/d", k), size, complete=True) for k, size in enumerate(4 * sizes)]
     cut = [choosing._View(("/d", k), 9000.0 + k, complete=False) for k in range(30, 40)]
@@ -582,9 +582,9 @@ def thumbnails(
     labels: Mapping[int, TrackLabel],
     missing: Sequence[int] = (),
 ) -> list[tuple[int, tuple[int, ...]]]:
-    """Return the number and RGB colour of the track of each thumbnail, as told by its picture.
+    """Return track number and RGB colour of each thumbnail, as read from its picture.
 
-    ``found`` are category and confidence of the tracks; those in ``missing`` have no pictures.
+    ``found`` are category and confidence of each track; tracks in ``missing`` have no picture.
     """
     line = Timeline(np.zeros(0), np.zeros(0, bool), np.zeros((0, 3)), (), np.zeros(3))
     cards = []

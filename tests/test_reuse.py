@@ -235,7 +235,7 @@ def test_reused_surfaces_and_boxes_stay_in_place_while_camera_moves() -> None:
 
 @pytest.mark.parametrize(("pixels", "alike"), [(1350, True), (1400, False)])
 def test_nearer_view_with_flipped_yaw_is_alike_up_to_noise(pixels: int, *, alike: bool) -> None:
-    """Reduced to the earlier distance, 1350 and 1400 pixels are 1.22 and 1.27 times 1000."""
+    """At the earlier distance, 1350 and 1400 pixels would be 1.22 and 1.27 times 1000."""
     center, sights = np.array([0.1, -0.2, 1.0]), []
     half = np.sqrt(0.5)
     for share, count, sides, turn in (

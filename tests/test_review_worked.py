@@ -214,7 +214,7 @@ def test_boxes_and_captions_are_those_of_their_objects(shown: dict[str, Any]) ->
 
 
 def test_full_boxes_are_dashed(shown: dict[str, Any]) -> None:
-    """Each edge has five dashes, from end to end, with gaps of their length."""
+    """Each edge has five dashes, from end to end, with gaps of the same length."""
     found = shown[f"{SEEN}/objects/full"]
     strips = np.array(found["LineStrips3D:strips"])
     colors = [packed(CUP, 0.45)] * 60 + [packed(CAN, 0.45)] * 60

@@ -95,7 +95,7 @@ def test_unwritable_path_is_reported_with_reason(tmp_path: Path) -> None:
 
 
 def make_run(folder: Path, **files: str) -> Path:
-    """Make a run folder as an earlier run left it; ``files`` have _ for the dot in their name."""
+    """Make a run folder as an earlier run left it; ``files`` are texts by name, with _ for dots."""
     folder.mkdir(parents=True)
     run = run_info(id=new_id())
     write_run(folder, run)
@@ -470,7 +470,7 @@ def test_scratch_that_may_be_in_use_is_not_removed(
 
 
 def test_locks_leave_no_open_file(temporary: Path) -> None:
-    """A process whose locks are refused, or end in errors, again and again would run out of files.
+    """If locks are refused, or end in errors, again and again, a process runs out of open files.
 
     After an error, it would also keep the lock until it ends.
     """

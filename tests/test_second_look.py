@@ -42,7 +42,7 @@ COUNT = 40
 DISTURBED = (7, 16, 17, 31)
 MANY = tuple(range(3, COUNT, 4))
 SHORTLY, BRIEF = 25, tuple(range(20, 24))
-"""The label of an object that only a tenth of the frames show if ``brief``, and their numbers."""
+"""The label of an object that only a tenth of the frames show if ``brief``, and those frames."""
 BLOCKS = Settings(reuse_frames=4)
 """Shorter blocks than usual, so that several are perceived again."""
 LEANING = Pose(np.array([[1.0, 0, 0], [0, 0.28, -0.96], [0, 0.96, 0.28]]), np.zeros(3))

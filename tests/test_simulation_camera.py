@@ -190,7 +190,7 @@ def test_kinect_disparity_is_quantized() -> None:
 
 @pytest.mark.parametrize("distance", [0.8, 1.6])
 def test_kinect_depth_noise_grows_with_squared_distance(distance: float) -> None:
-    """Real frames have 0.0020 1/m of inverse depth (window of 40 pixels) at any distance."""
+    """In real frames, inverse depth has a noise of 0.0020 1/m (40-pixel window) everywhere."""
     sensor = dataclasses.replace(KINECT, fixed_error=0.0)
     depth, _ = measure(wall_image(sensor, distance), sensor, np.random.default_rng(0))
     inverse = 1 / depth[depth > 0].astype(np.float64)
@@ -312,7 +312,7 @@ def test_matching_windows_blend_small_steps_alone(height: float, wide: tuple[int
 
 
 def test_table_at_low_angle_has_no_missing_margins() -> None:
-    """Its inverse depth changes as much in a few pixels as at an outline, but it has none."""
+    """Its inverse depth changes as much in a few pixels as at an outline, but there is none."""
     pose = looking_at(np.array([0, 0, 0.35]), np.array([0, 1.0, 0.2]))
     sensor = dataclasses.replace(PRESETS["d455"], holes=0.0, grazing_cosine=0.0, border_px=(0,) * 4)
     image = render(geometry([(big_quad(0.0), HERE)]), sensor.camera, pose)

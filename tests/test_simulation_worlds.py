@@ -73,7 +73,7 @@ def test_category_is_ambiguous_if_little_of_object_is_visible(
 
 
 def test_truth_states_how_objects_stand() -> None:
-    """Results are judged by these fields, and apart for lying or tilted objects."""
+    """Results are judged by these fields, separately for lying or tilted objects."""
     names = (
         "label",
         "category",
@@ -117,7 +117,7 @@ def top_view(mesh: Mesh, pose: Pose) -> Bool:
 
 
 def test_objects_do_not_interpenetrate(world: World) -> None:
-    """Where two of them are at the same height, no vertical line meets both."""
+    """Where two objects overlap in height, no vertical line may meet both."""
     here = Pose(np.eye(3), np.zeros(3))
     solids = [(item.mesh, item.pose) for item in world.objects]
     solids += [(s.mesh, here) for s in world.supports if s.name != "floor"]

@@ -54,7 +54,7 @@ def test_smoothing_is_independent_of_position_and_order() -> None:
 
 
 def test_points_with_few_neighbours_are_removed() -> None:
-    """The count must match the distances of all pairs."""
+    """The count must agree with the distances between all pairs of points."""
     rng = np.random.default_rng(3)
     points = np.c_[rng.uniform(0, 0.1, (200, 2)), rng.normal(0, 1e-3, 200)].astype("f4")
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)

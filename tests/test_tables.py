@@ -162,7 +162,7 @@ def test_segments_are_written_when_full_or_old(
 def test_long_run_stays_in_the_order_of_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
 ) -> None:
-    """After half an hour there are a thousand segments; out of order, exports would fail."""
+    """After half an hour there are a thousand segments; exports fail if they are out of order."""
     monkeypatch.setattr("shapecat.runs.perceive.perceived._SEGMENT_FRAMES", 1)
     with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1") as tables:
         for index in range(4):

@@ -557,7 +557,7 @@ def test_object_in_bowl_whose_size_varies_keeps_its_track() -> None:
 
 
 def test_object_put_onto_plate_on_tray_gets_own_track() -> None:
-    """Plate and tray enclosed its place only before it came; pieces are enclosed afterwards, too."""
+    """Plate and tray enclosed its place only before it came; pieces are enclosed later, too."""
     empty = [(0.0, 0.4), (0.08, 0.26)]
     tracks = track_frames(boxed([empty] * 30 + [[*empty, (0.1, 0.16)]] * 8), SETTINGS)
     assert sorted(track.hits for track in tracks) == [8, 38, 38]
