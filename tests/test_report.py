@@ -356,7 +356,7 @@ def depth_frame(depth: np.ndarray) -> Frame:
 
 
 def view(blur: float = 0, left: int = 60, top: int = 50, hidden: float = 0, side: int = 80) -> Any:
-    """Return a view of a square object in a striped photograph."""
+    """Return a view of a square object in a striped photograph; lengths in pixels."""
     stripes = 127 + 100 * np.sign(np.sin(np.arange(240) / 3))
     photo = ndimage.gaussian_filter(np.tile(stripes, (180, 1)), blur)
     mask = Mask(left, top, np.ones((side, side), bool))

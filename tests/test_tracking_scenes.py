@@ -338,7 +338,7 @@ def test_identities_survive_noise_misses_splits_and_occlusions(
 
 
 def test_score_agrees_with_motmetrics() -> None:
-    """Guards the metrics themselves."""
+    """With wrong metrics, the test above would pass although identities are lost."""
     motmetrics = pytest.importorskip("motmetrics")
     rows, truth = record(*turntable(7), 7)
     tracks = tuple(track_frames(rows, SETTINGS))
