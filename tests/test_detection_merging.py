@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, project
+from shapecat.detection.merging import across_occlusion
 from shapecat.detection.merging.across_occlusion import merge_across_occluder
 from shapecat.detection.merging.adjacency import measure_adjacency
 from shapecat.detection.merging.pair_features import (
@@ -18,6 +19,7 @@ from shapecat.detection.merging.segment_features import (
     write_segment_features,
 )
 from shapecat.detection.merging.segments import Segments, measure_segments, merge
+from shapecat.detection.merging.settings import MERGING
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph, connect_surfaces
 from shapecat.geometry import DISCONTINUITY
@@ -147,3 +149,21 @@ def test_coplanar_parts_without_an_occluder_are_not_merged() -> None:
     segments, graph, grid = measured(depth, labels)
     merge_across_occluder(segments, grid, graph.normal, labels)
     assert segments.parent.tolist() == [0, 1, 2]
+
+
+def test_point_just_outside_the_image_is_in_no_cell() -> None:
+    """Rounded towards zero, it would count as hidden by what is in the first row or column."""
+    x, y = (np.array([-0.6, -1.4]) - [INTRINSICS.cx, INTRINSICS.cy]) / INTRINSICS.fx
+
+    assert project(INTRINSICS, x, y, 1.0) == (-1, -1)
+
+
+def test_number_of_lines_between_two_parts_is_limited() -> None:
+    """Their cost grows with their number, and coplanar parts have a pair for any two samples."""
+    planes = np.zeros((2, 24, 3))
+    planes[0, :, 0], planes[1, :, 2] = np.linspace(0, 0.1, 24), 1
+
+    share_of_partners, lines = across_occlusion._find_partners(planes, planes)
+
+    assert share_of_partners == 1
+    assert 24 * 24 / 3 < len(lines) <= MERGING.max_lines

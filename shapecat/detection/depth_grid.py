@@ -155,7 +155,7 @@ def project(k: PinholeIntrinsics, x: float, y: float, z: float) -> tuple[int, in
 
     The point ``x``, ``y``, ``z`` is in metres, in the frame of the grid's camera.
     """
-    return int(k.cy + k.fy * y / z + 0.5), int(k.cx + k.fx * x / z + 0.5)
+    return math.floor(k.cy + k.fy * y / z + 0.5), math.floor(k.cx + k.fx * x / z + 0.5)
 
 
 def smallest_object_at(grid: DepthGrid, depth_m: F4) -> F4:

@@ -115,7 +115,7 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
                 with_a[s] = with_b[t] = True
                 pairs[n, 0], pairs[n, 1] = s, t
                 n += 1
-    stride = max(1, n // MERGING.max_lines)
+    stride = max(1, -(-n // MERGING.max_lines))
     lines = np.zeros(((n + stride - 1) // stride, 2, 3))
     for k in range(len(lines)):
         s, t = pairs[k * stride]
