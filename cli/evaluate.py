@@ -46,8 +46,8 @@ def evaluate(
                   random forest on distributions of distances, areas and angles
 
     \b
-    shapecat evaluate crops --model mine.npz --report crops.html
-    shapecat evaluate crops --model mine.npz --baselines crops
+    shapecat evaluate other-crops --model mine.npz --report page.html
+    shapecat evaluate other-crops --model mine.npz --baselines crops
     """
     from shapecat.evaluation import evaluate_folder, format_report
     from shapecat.evaluation.page import write_page

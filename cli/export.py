@@ -92,8 +92,8 @@ def export(
     OUT; the other formats write one folder per run, OUT/NAME, named after the run.
 
     \b
-    coco          image segmentation: images with masks (RLE), boxes and tracks
-    yolo          image segmentation: images with a polygon per object
+    coco          instance segmentation: images with masks (RLE), boxes and tracks
+    yolo          instance segmentation: images with a polygon per object
     crops         points of each object, for `shapecat train` and `learn`
     kitti         3D detection: label_2, calib, velodyne, image_2
     labelcloud    3D boxes to edit by hand in the tool labelCloud

@@ -141,7 +141,7 @@ def process(
     Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a folder with
     recordings, or a URL. The results of lab.mcap go to OUT/lab: tables, annotated.mcap for
     Foxglove, and review.rrd for Rerun. If recordings have the same name, the name of the folder
-    comes first, as in OUT/monday_lab; if these names are equal, too, a number is appended.
+    comes first, as in OUT/monday_lab; if those are the same as well, a number is appended.
     For several recordings, OUT/manifest.jsonl records the state of each. To resume after an
     interruption, run the same command again.
 

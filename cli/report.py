@@ -30,12 +30,12 @@ def report(
 ) -> None:
     """Make a page per run to review and correct tracks in a browser.
 
-    Each DIR is a run, or a folder of runs. The page of a run is RUN/report.html. For several runs,
-    an index.html is also written to the folder that contains them all. A page needs no network and
-    can be sent by e-mail. Download the corrected table from it and apply it with `shapecat
-    annotate`. With --serve, the page writes corrections to RUN/tracks.csv as you make them;
-    `shapecat annotate RUN` then applies them to the other files. If a recording was moved, first
-    run `shapecat annotate RUN --recording PATH`.
+    Each DIR is a run (RUN), or a folder of runs. The page of a run is RUN/report.html. For several
+    runs, an index.html is also written to the folder that contains them all. A page needs no
+    network and can be sent by e-mail. Download the corrected table from it and apply it with
+    `shapecat annotate`. With --serve, the page writes corrections to RUN/tracks.csv as you make
+    them; `shapecat annotate RUN` then applies them to the other files. If a recording was moved,
+    first run `shapecat annotate RUN --recording PATH`.
 
     \b
     shapecat report results

@@ -91,7 +91,7 @@ def test_unreadable_file_is_not_skipped(source: Path, monkeypatch: pytest.Monkey
 
 
 def test_recordings_are_known_by_their_first_bytes(tmp_path: Path) -> None:
-    """A recording without the usual ending of its name would be missing from the results."""
+    """A recording without its usual suffix would be missing from the results."""
     starts = {"a": b"\x89MCAP0\r\n", "b": b"#ROSBAG V2.0\n", "c": b"SQLite format 3\0"}
     for name, content in {**starts, "d": b"SQLite", "e": b"MCAP", "f.mcap": b""}.items():
         (tmp_path / name).write_bytes(content)
@@ -1082,9 +1082,9 @@ def test_other_frames_model_or_settings_are_other_work(
     model: Path | None,
     place: str,
 ) -> None:
-    """Results at a URL, and those of an interrupted --overwrite, are told apart by this key alone.
+    """Results at a URL, and those of an interrupted --overwrite, are told apart by ``work`` alone.
 
-    With an equal key, old results would be kept. A copy of the model does not change the key.
+    If it was equal, old results would be kept. A copy of the model does not change it.
     """
     monkeypatch.chdir(source.parent)
     (source.parent / "other.mcap").write_bytes(b"another")

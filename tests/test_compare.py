@@ -350,9 +350,9 @@ def test_identity_switch_is_counted_once() -> None:
 def test_identity_switch_is_not_counted_beside_another_difference(
     other: tuple[int | None, str],
 ) -> None:
-    """A row has one difference: beside a wrong category, only the figures count the switch.
+    """The table names one difference per object: a wrong category hides the switch.
 
-    A detection without a track is not another track.
+    Only the tracking metrics count it then. A detection without a track is not a switch.
     """
     tally, cup = Tally(), LabelledItem(11, "cup")
     track, category = other

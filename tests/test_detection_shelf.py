@@ -162,7 +162,7 @@ def test_bottle_with_flat_shoulder_is_not_split() -> None:
 
 
 def test_lid_is_merged_with_its_box() -> None:
-    """The seam looks like a top face, along a third or more of both outlines."""
+    """Along a third or more of both outlines, their seam looks like the edge of a top face."""
     assert overlap_in_shelf(263, 30) > 0.8
 
 

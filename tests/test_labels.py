@@ -376,7 +376,7 @@ def test_notes_in_columns_without_a_name_are_kept(run: Path) -> None:
 
 @pytest.mark.parametrize("label", ["none", "new None", "DontCare", "NA", "new nan", "Null"])
 def test_names_that_mean_no_object_to_readers_are_refused(run: Path, label: str) -> None:
-    """KITTI readers ignore DontCare; class 0 of point labels is none; pandas drops NA and nan."""
+    """KITTI readers ignore DontCare, pandas drops NA, and class 0 of point labels is "none"."""
     (run / "tracks.csv").write_text(labelled(t4=label))
 
     with pytest.raises(OutputError, match="is not a category"):

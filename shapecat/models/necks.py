@@ -116,30 +116,30 @@ def _distances(links: U1, spans: I4, labels: I4) -> tuple[I4, int]:
 
 
 @kernel
-def _inner_first(depth: I4, labels: I4, spans: I4, columns: int, count: int) -> I4:
-    """Return the flat indices (count,) of the labelled cells, farthest from the border first.
+def _inner_first(distance: I4, labels: I4, spans: I4, columns: int, count: int) -> I4:
+    """Return the flat indices (count,) of the labelled cells, farthest from their border first.
 
-    ``depth`` and ``count`` are from `_distances`; ``depth`` and ``labels`` are flattened, and have
-    ``columns`` columns. ``spans`` are as in `SurfaceGraph`.
+    ``distance`` and ``count`` are from `_distances`; ``distance`` and ``labels`` are flattened
+    images, ``columns`` wide. ``spans`` are as in `SurfaceGraph`.
     """
     deepest = 0
     for i in range(len(spans)):
         for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
             if labels[p] > 0:
-                deepest = max(deepest, depth[p])
+                deepest = max(deepest, distance[p])
     ends = np.zeros(deepest + 2, np.int32)
     for i in range(len(spans)):
         for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
             if labels[p] > 0:
-                ends[depth[p]] += 1
+                ends[distance[p]] += 1
     for d in range(deepest, 0, -1):
         ends[d - 1] += ends[d]
     cells: I4 = unset(count, np.int32)
     for i in range(len(spans)):
         for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
             if labels[p] > 0:
-                ends[depth[p]] -= 1
-                cells[ends[depth[p]]] = p
+                ends[distance[p]] -= 1
+                cells[ends[distance[p]]] = p
     return cells
 
 

@@ -153,7 +153,8 @@ def _warn_about_unread(recording: Recording) -> None:
 class _NearSensor(NamedTuple):
     """The depth streams of a sensor near a colour topic.
 
-    ``shared`` is the largest number of namespace components that one of them shares with the topic.
+    ``shared`` is the largest number of namespace components that a stream of one kind shares with
+    the topic.
     """
 
     shared: int

@@ -144,7 +144,7 @@ class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         self.name, self.file, self.code = name, file, code
 
     def pytest_sessionstart(self) -> None:
-        """Register before pytest's own finder, which loads modules with examples."""
+        """Come before pytest's import hook, which would load the modules that have doctests."""
         sys.meta_path.insert(0, self)
 
     def find_spec(

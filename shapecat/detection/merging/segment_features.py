@@ -71,8 +71,8 @@ def lateral_curvature(row: Row) -> float:
 def normal_position_correlation(row: Row) -> float:
     """Return the correlation between the lateral components of normal and position.
 
-    It is 1 for a solid of revolution with an upright axis, and less for the faces of a box and for
-    level tops, whose normals do not turn steadily.
+    It is near 1 for the outside of a solid of revolution with an upright axis, and less for the
+    faces of a box and for level tops, whose normals do not turn steadily.
     """
     spread, turning, product = _moments(row)
     return float(product / math.sqrt(max(spread * turning, 1e-12)))

@@ -143,9 +143,9 @@ def _around(stream: _Stream, k: int) -> I4:
 
 
 def _other_support(stream: _Stream, off: Bool) -> Bool:
-    """Return whether frames (n,) lack a plane at the height of the lowest planes nearby in time.
+    """Return whether each frame (n,) lacks a plane where the frames around it have their lowest.
 
-    ``off`` (n,) marks the frames that are not compared.
+    It does not if the frames around it disagree. ``off`` (n,) marks frames that are ignored.
     """
     is_other = np.zeros(len(off), np.bool_)
     for k in np.flatnonzero(~off):

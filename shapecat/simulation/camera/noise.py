@@ -44,7 +44,10 @@ def noise(
 
 
 def _gain(width: int, times: int) -> float:
-    """Return the gain in standard deviation of ``times`` moving sums over ``width`` samples."""
+    """Return the factor by which moving sums raise the standard deviation of white noise.
+
+    Each of the ``times`` successive sums is over ``width`` samples.
+    """
     weights = np.ones(1)
     for _ in range(times):
         weights = np.convolve(weights, np.ones(width))
