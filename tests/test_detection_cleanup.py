@@ -199,10 +199,10 @@ def test_context_weights_neighbours_by_border_length() -> None:
     segments.pairs["in_front"][4, 1], segments.pairs["near"][4, 2] = 3, 1
     roots = roots_of(segments)
     assert roots.tolist() == [1, 2, 4]
-    weights = measure_borders(segments, roots)
+    borders = measure_borders(segments, roots)
     features = np.zeros(3, OBJECT_FEATURES)
     features["segment"]["width_m"] = [0.1, 0.2, 0.3]
-    found = add_context(features, np.array([8.0, -1.0, -4.0], np.float32), weights)
+    found = add_context(features, np.array([8.0, -1.0, -4.0], np.float32), borders)
     assert found["object"]["segment"]["width_m"] == pytest.approx([0.1, 0.2, 0.3])
     assert found["logit"].tolist() == [8, -1, -4]
     yes, uncertain, no = np.tanh([2, -0.25, -1])

@@ -186,10 +186,10 @@ def test_plate_in_noise_is_found_and_depth_error_is_not() -> None:
 
 
 def test_outline_of_object_rises_on_all_sides() -> None:
-    round_ = Outline(sides=100, table=95, bounded=95, hidden=0, rise=150.0, steep=90)
+    round_ = Outline(sides=100, facing=95, bounded=95, hidden=0, rise=150.0, steep=90)
     assert is_object(round_, 600)
     assert not is_object(round_._replace(steep=50), 600)  # depth error rises only in places
-    assert not is_object(round_._replace(table=30, bounded=40, rise=60.0), 600)
+    assert not is_object(round_._replace(facing=30, bounded=40, rise=60.0), 600)
     assert not is_object(round_._replace(rise=90.0), 600)
 
 

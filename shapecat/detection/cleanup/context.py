@@ -37,24 +37,24 @@ def measure_borders(segments: Segments, roots: I4) -> F4:
     """
     index = np.ix_(roots, roots)
     contact, in_front, near = (segments.pairs[n][index] for n in ("contact", "in_front", "near"))
-    weights = np.stack([contact + contact.T, in_front, in_front.T, near + near.T])
-    weights[:, np.arange(len(roots)), np.arange(len(roots))] = 0
-    return weights
+    borders = np.stack([contact + contact.T, in_front, in_front.T, near + near.T])
+    borders[:, np.arange(len(roots)), np.arange(len(roots))] = 0
+    return borders
 
 
-def add_context(features: Records, logits: F4, weights: F4) -> Records:
+def add_context(features: Records, logits: F4, borders: F4) -> Records:
     """Return the `CONTEXT_FEATURES` of the merged segments of a frame, as records (r,).
 
     Parameters
     ----------
     features : (r,) `OBJECT_FEATURES` of the segments.
     logits : (r,) log-odds that each segment is an object, classified without its neighbours.
-    weights : (4, r, r) lengths of the borders, by kind, from `measure_borders`.
+    borders : (4, r, r) lengths of the borders, by kind, from `measure_borders`.
     """
     records = np.zeros(len(features), CONTEXT_FEATURES)
     records["object"], records["logit"] = features, logits
     verdicts = np.tanh(logits / CLEANUP.sure_logit)
-    means = weights @ verdicts / np.maximum(weights.sum(axis=2), 1)
+    means = borders @ verdicts / np.maximum(borders.sum(axis=2), 1)
     for name, mean in zip(_NEIGHBOURS, means, strict=True):
         records[name] = mean
     return records

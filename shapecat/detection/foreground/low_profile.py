@@ -285,7 +285,7 @@ def _drop_error(
         if count < LOW.small_part:
             continue
         line = measure_outline(inv_depth, residual, plane_id, part, cells, count, number, limits)
-        if line.table >= LOW.facing_share * line.sides and line.rise < line.table:
+        if line.facing >= LOW.facing_share * line.sides and line.rise < line.facing:
             for t in range(count):
                 plane_ids[cells[t]] = -number
     return parts

@@ -35,15 +35,15 @@ class Outline(NamedTuple):
     Attributes
     ----------
     sides : all sides.
-    table : sides that face the plane.
-    bounded : ``table`` sides, sides next to higher cells, and sides in front of a farther surface.
+    facing : sides that face the plane.
+    bounded : ``facing`` sides, sides next to higher cells, and sides in front of a farther surface.
     hidden : sides next to a nearer surface, or to a cell without depth.
-    rise : sum of the rises of the ``table`` sides, each divided by the minimum mean rise.
-    steep : steep sides among the ``table`` sides.
+    rise : sum of the rises of the ``facing`` sides, each divided by the minimum mean rise.
+    steep : steep sides among the ``facing`` sides.
     """
 
     sides: int
-    table: int
+    facing: int
     bounded: int
     hidden: int
     rise: float
@@ -68,15 +68,15 @@ def width_of_part(inv_depth: F4, cells: I4, count: int) -> float:
 @kernel(inline=True)
 def is_object(outline: Outline, count: int) -> bool:
     """Return whether an outline around ``count`` cells belongs to an object."""
-    table, sides = outline.table, outline.sides
-    if table < OUTLINES.bounded_share * sides and sides * sides > OUTLINES.ragged * count:
+    facing, sides = outline.facing, outline.sides
+    if facing < OUTLINES.bounded_share * sides and sides * sides > OUTLINES.ragged * count:
         return False
     visible = sides - (outline.hidden if count > OUTLINES.broad * sides else 0)
-    min_table = max(OUTLINES.min_sides, OUTLINES.table_share * sides)
-    if table < min_table or outline.bounded < OUTLINES.bounded_share * visible:
+    min_facing = max(OUTLINES.min_sides, OUTLINES.facing_share * sides)
+    if facing < min_facing or outline.bounded < OUTLINES.bounded_share * visible:
         return False
-    min_rise = max(table * (1 + OUTLINES.chance / sides), OUTLINES.all_around * sides)
-    return bool(outline.rise > min_rise and outline.steep > OUTLINES.steep_share * table)
+    min_rise = max(facing * (1 + OUTLINES.chance / sides), OUTLINES.all_around * sides)
+    return bool(outline.rise > min_rise and outline.steep > OUTLINES.steep_share * facing)
 
 
 @kernel(inner=True)
@@ -107,7 +107,7 @@ def measure_outline(
     rows, columns = residual.shape
     parts = part.reshape(-1)
     jump = limits.discontinuity
-    sides = table = bounded = hidden = steep = 0
+    sides = facing = bounded = hidden = steep = 0
     rise, outward = 0.0, LOW.rise_cells - OUTLINES.inward
     label = parts[cells[0]]
     for t in range(count):
@@ -134,11 +134,11 @@ def measure_outline(
             bounded += 0 < inv_depth[y, x] < inv_depth[i, j] - jump
             if plane_id[y, x] != -number or residual[y, x] == 0 or abs(plane_id[v, u]) != number:
                 continue
-            table += 1
+            facing += 1
             bounded += 1
             step = (residual[v, u] - residual[y, x]) / limits.rise
             if residual[v, u] == 0:  # the inside is not low
                 step = OUTLINES.max_rise
             rise += min(step, OUTLINES.max_rise)
             steep += int(step > OUTLINES.steep)
-    return Outline(sides, table, bounded, hidden, rise, steep)
+    return Outline(sides, facing, bounded, hidden, rise, steep)

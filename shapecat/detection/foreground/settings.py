@@ -70,7 +70,7 @@ class OutlineSettings(NamedTuple):
     """Distance from the outline, in cells, at which its inside is measured."""
     min_sides: int = 30
     """Minimum number of sides that face the plane; fewer prove nothing."""
-    table_share: float = 0.4
+    facing_share: float = 0.4
     """Minimum fraction of all sides that face the plane."""
     bounded_share: float = 0.65
     """Minimum fraction of bounded sides among those that are not hidden."""

@@ -108,11 +108,11 @@ def _is_at_range_end(inv_depth: F4, strips: DepthSamples) -> bool:
     return bool(np.median(strips.inverse_depth) < STRIPS.end * valid.min(initial=np.inf))
 
 
-def _widened(candidate: PlaneCandidate, table: PlaneCandidate) -> PlaneCandidate:
-    """Return ``candidate`` with the covered area of ``table``, and extended to its outline."""
-    extent = np.maximum(candidate.plane.extent, table.plane.extent)
+def _widened(candidate: PlaneCandidate, covered: PlaneCandidate) -> PlaneCandidate:
+    """Return ``candidate`` with the covered area of ``covered``, and extended to its outline."""
+    extent = np.maximum(candidate.plane.extent, covered.plane.extent)
     plane = candidate.plane._replace(extent=extent)
-    return candidate._replace(plane=plane, covered_m2=table.covered_m2)
+    return candidate._replace(plane=plane, covered_m2=covered.covered_m2)
 
 
 def _plane_at(grid: DepthGrid, strips: F4, up: F8, height: float) -> PlaneCandidate:
