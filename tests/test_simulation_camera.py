@@ -12,9 +12,9 @@ from shapecat.simulation.camera.presets import IDEAL, KINECT, PRESETS, REALSENSE
 from shapecat.simulation.camera.render import (
     Geometry,
     Image,
-    alone_pixels,
     cropped,
     geometry,
+    pixels_if_unoccluded,
     render,
 )
 from shapecat.simulation.camera.sensors import Sensor, resized
@@ -130,7 +130,7 @@ def test_depth_agrees_with_open3d_rays() -> None:
     assert (difference > 1e-3).mean() < 0.002
 
 
-def test_alone_pixels_include_occluded_ones() -> None:
+def test_pixels_if_unoccluded_include_occluded_ones() -> None:
     cube = rounded_box([0.2, 0.2, 0.2])
     behind = (cube, Pose(np.eye(3), np.array([0, 0, 1.5])))
     before = (cube, Pose(np.eye(3), np.array([0.1, 0, 1.0])))
@@ -138,7 +138,7 @@ def test_alone_pixels_include_occluded_ones() -> None:
     visible = int((render(both, CAMERA, HERE).mesh_ids == 0).sum())
     alone = int((render(geometry([behind]), CAMERA, HERE).mesh_ids == 0).sum())
 
-    assert alone_pixels(both, 0, CAMERA, HERE) == alone
+    assert pixels_if_unoccluded(both, 0, CAMERA, HERE) == alone
     assert 0 < visible < 0.7 * alone
 
 
@@ -297,7 +297,7 @@ def test_matching_windows_round_the_corners_of_outlines() -> None:
 
 
 @pytest.mark.parametrize(("height", "wide"), [(0.015, (7, 12)), (0.1, (0, 2))])
-def test_matching_windows_blend_small_steps_alone(height: float, wide: tuple[int, int]) -> None:
+def test_matching_windows_blend_only_small_steps(height: float, wide: tuple[int, int]) -> None:
     """At a step of a few centimetres, real depth changes over the width of a window, without holes.
 
     Larger steps stay sharp; the pixels between would be flying pixels.
@@ -329,7 +329,7 @@ def test_time_of_flight_noise_grows_with_distance(z: float) -> None:
     sensor = dataclasses.replace(PRESETS["l515"], fixed_error=0.0, holes=0.0)
     depth, _ = measure(wall_image(sensor, z), sensor, np.random.default_rng(0))
 
-    assert depth[depth > 0].std() == pytest.approx(sensor.noise_m * z, rel=0.1)
+    assert depth[depth > 0].std() == pytest.approx(sensor.relative_noise * z, rel=0.1)
 
 
 def test_stereo_holes_are_patches() -> None:

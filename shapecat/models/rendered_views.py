@@ -80,7 +80,7 @@ def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
     sensor = replace(
         sensor,
         noise=float(sensor.noise * noise),
-        noise_m=float(sensor.noise_m * noise),
+        relative_noise=float(sensor.relative_noise * noise),
         fixed_error=float(sensor.fixed_error * fixed_error),
         device=int(rng.integers(1_000_000)),
         edge_jitter_px=float(sensor.edge_jitter_px * edge_jitter),

@@ -6,7 +6,7 @@ import numpy as np
 
 from shapecat.arrays import F8, U1
 from shapecat.geometry import compose, inverse, transform, upright_box
-from shapecat.simulation.camera.render import alone_pixels
+from shapecat.simulation.camera.render import pixels_if_unoccluded
 from shapecat.simulation.scenes.worlds import PlacedObject, Support, World
 from shapecat.types import Camera, Pose
 
@@ -39,7 +39,7 @@ def frame_truth(world: World, frame: int, labels: U1, camera: Camera) -> dict[st
     for mesh_id, item in enumerate(world.objects, start=len(world.supports)):
         if world.present(item, frame):
             pixels = int(counts[item.label])
-            total = alone_pixels(geometry, mesh_id, camera, world_from_camera)
+            total = pixels_if_unoccluded(geometry, mesh_id, camera, world_from_camera)
             share = min(1.0, pixels / total) if total else 0.0
             entry = _object_truth(world, frame, item, pixels, share)
             (objects if pixels >= LISTED_PIXELS else hidden).append(entry)

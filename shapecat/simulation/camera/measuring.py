@@ -65,8 +65,8 @@ def _inverse_depth_error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
         error += noise(
             inverse.shape, sensor.noise_window, sensor.noise, rng, smoothings=sensor.smoothings
         )
-    if sensor.noise_m > 0:
-        relative = noise(inverse.shape, sensor.noise_window, sensor.noise_m, rng)
+    if sensor.relative_noise > 0:
+        relative = noise(inverse.shape, sensor.noise_window, sensor.relative_noise, rng)
         error += relative * inverse.astype(np.float32)
     if sensor.fixed_error > 0:
         error += fixed_error(

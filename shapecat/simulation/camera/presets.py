@@ -60,7 +60,7 @@ _KINECT_V2 = Sensor(
     _camera(512, 424, 365.0),
     nearest_m=0.5,
     farthest_m=4.5,
-    noise_m=0.0018,
+    relative_noise=0.0018,
     noise_window=(3, 3),
     fixed_error=0.002,
     fixed_error_px=100,
@@ -77,7 +77,7 @@ _KINECT_V2 = Sensor(
 _AZURE_KINECT = Sensor(
     _camera(640, 576, 504.0),
     nearest_m=0.45,
-    noise_m=0.0011,
+    relative_noise=0.0011,
     noise_window=(3, 3),
     fixed_error=0.0015,
     fixed_error_px=120,
@@ -183,7 +183,7 @@ camera, 2017."""
 _L515 = Sensor(
     _camera(640, 480, 460.0),
     nearest_m=0.25,
-    noise_m=0.0025,
+    relative_noise=0.0025,
     noise_window=(2, 2),
     fixed_error=0.001,
     fixed_error_px=140,
@@ -201,7 +201,7 @@ comparison of D415, D455, L515, 2021."""
 _PHONE = Sensor(
     _camera(256, 192, 212.0),
     nearest_m=0.25,
-    noise_m=0.0025,
+    relative_noise=0.0025,
     noise_window=(5, 5),
     fixed_error=0.004,
     fixed_error_px=50,

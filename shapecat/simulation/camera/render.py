@@ -11,7 +11,7 @@ from shapecat.jit import kernel
 from shapecat.simulation.shapes.mesh import Mesh
 from shapecat.types import Camera, Pose
 
-__all__ = ["Geometry", "Image", "alone_pixels", "cropped", "geometry", "render"]
+__all__ = ["Geometry", "Image", "cropped", "geometry", "pixels_if_unoccluded", "render"]
 
 NEAR_M = 0.02
 """A triangle is skipped if all corners are nearer than this; if some are, all pixels are tested."""
@@ -102,7 +102,9 @@ def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Cam
     return Camera(width, height, camera.fx, camera.fy, camera.cx - left, camera.cy - top)
 
 
-def alone_pixels(scene: Geometry, mesh_id: int, camera: Camera, frame_from_camera: Pose) -> int:
+def pixels_if_unoccluded(
+    scene: Geometry, mesh_id: int, camera: Camera, frame_from_camera: Pose
+) -> int:
     """Count the pixels that mesh ``mesh_id`` would have if nothing occluded it.
 
     Pixels up to one image width or height beyond the image border count, too. The result is 0 if a

@@ -20,7 +20,8 @@ class Sensor:
     nearest_m, farthest_m : limits of the measured depth.
     step : quantization of the inverse depth, 1/m; 0 for none.
     noise : standard deviation of the inverse depth, 1/m, for cameras that triangulate.
-    noise_m : standard deviation of the depth, relative to the depth, for time-of-flight cameras.
+    relative_noise : standard deviation of the depth, relative to the depth, for time-of-flight
+        cameras.
     noise_window : (across, down) correlation window of the noise, pixels.
     smoothings : number of times that the noise and the edge jitter are averaged over their windows.
     fixed_error : standard deviation of the device's low-frequency error of the inverse depth, 1/m;
@@ -53,7 +54,7 @@ class Sensor:
     farthest_m: float = 4.0
     step: float = 0.0
     noise: float = 0.0
-    noise_m: float = 0.0
+    relative_noise: float = 0.0
     noise_window: tuple[int, int] = (1, 1)
     smoothings: int = 1
     fixed_error: float = 0.0
