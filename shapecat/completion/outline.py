@@ -18,8 +18,8 @@ __all__ = [
     "QUARTER",
     "SINES",
     "fit_oval",
-    "narrowest",
     "rectangle",
+    "smallest_rectangle_side",
     "support_function",
 ]
 
@@ -139,7 +139,7 @@ def fit_oval(outline: F8, facing_weights: F8, roundness: float) -> tuple[F8, flo
 
 
 @kernel
-def narrowest(reached: F8) -> int:
+def smallest_rectangle_side(reached: F8) -> int:
     """Return the direction of the smallest rectangle around an outline: an index below `QUARTER`.
 
     ``reached`` (`DIRECTIONS`,) is the support function, metres.
@@ -159,7 +159,7 @@ def rectangle(reached: F8, side: int) -> tuple[float, float, float, float]:
     Parameters
     ----------
     reached : (`DIRECTIONS`,) metres, the support function.
-    side : index of the direction, from `narrowest`.
+    side : index of the direction, from `smallest_rectangle_side`.
 
     Returns
     -------

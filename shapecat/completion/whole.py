@@ -12,8 +12,8 @@ from shapecat.completion.outline import (
     COSINES,
     SINES,
     fit_oval,
-    narrowest,
     rectangle,
+    smallest_rectangle_side,
     support_function,
 )
 from shapecat.geometry import levelled, quaternion_from_rotation
@@ -160,7 +160,7 @@ def footprint(outline: F8, facing: F8, posterior: F8, categories: Sequence[str])
         oval = np.maximum(oval, np.where(facing > 0, outline, oval))
     full_outline = oval if deviation < prior.fits * radius else outline
     chosen = outline if category == _ANGULAR else full_outline
-    side = narrowest(chosen)
+    side = smallest_rectangle_side(chosen)
     along, across, *size = rectangle(chosen, side)
     guessed = np.subtract(size, rectangle(outline, side)[2:])
     doubt = math.sqrt(angular * (1 - angular)) * np.subtract(
