@@ -29,7 +29,7 @@ class RecentFrames:
         """Keep ``count - 1`` frames of each topic, so that ``count`` are fused into one."""
         self._kept = count - 1
         self._recent: dict[str, deque[tuple[Frame, Pose | None]]] = {}
-        self._loose: Counter[str] = Counter()
+        self._clouds: Counter[str] = Counter()
         self._unplaced: Counter[str] = Counter()
 
     def before(self, frame: Frame, fixed_from_sensor: Pose | None) -> tuple[Earlier, ...]:
@@ -43,7 +43,7 @@ class RecentFrames:
         if not self._kept:
             return ()
         if not frame.organized:
-            self._loose[frame.topic] += 1
+            self._clouds[frame.topic] += 1
             return ()
         self._unplaced[frame.topic] += fixed_from_sensor is None
         recent = self._recent.setdefault(frame.topic, deque(maxlen=self._kept))
@@ -57,7 +57,7 @@ class RecentFrames:
         """Return warnings for the user about the frames so far."""
         return [
             f"{topic}: clouds are not fused, only depth images (frames: {n})"
-            for topic, n in self._loose.items()
+            for topic, n in self._clouds.items()
         ] + [
             f"{topic}: the pose of the sensor is unknown (frames: {n}): where their depths agree, "
             "these frames are fused as if it had not moved"
