@@ -37,7 +37,7 @@ def test_segments_of_objects_and_bin_walls_are_labelled() -> None:
     (samples,) = label_objects(frame, pixel_labels, object_labels)
     assert set(samples.objects.tolist()) == {True, False}
     assert np.isfinite(as_rows(samples.features)).all()
-    assert samples.weights[0].shape == (4, len(samples.objects), len(samples.objects))
+    assert samples.borders[0].shape == (4, len(samples.objects), len(samples.objects))
     (none,) = label_objects(frame, pixel_labels, object_labels[:0])
     assert none.objects.tolist() == [False] * len(samples.objects)
 
@@ -169,14 +169,14 @@ def test_trees_in_context_learn_from_the_logits_of_neighbours() -> None:
     for _ in range(60):
         features = np.zeros(3, OBJECT_FEATURES)
         features["segment"]["top_m"] = rng.normal([0.5, 0.1, 0.1], 0.01)
-        weights = np.zeros((4, 3, 3), np.float32)
-        weights[0, 0, 1] = weights[0, 1, 0] = 5
-        samples.append(Samples(features, np.array([False, False, True]), (weights,)))
+        borders = np.zeros((4, 3, 3), np.float32)
+        borders[0, 0, 1] = borders[0, 1, 0] = 5
+        samples.append(Samples(features, np.array([False, False, True]), (borders,)))
     alone, in_context = grow_rejection_trees(samples, 0)
     features["segment"]["top_m"] = [0.5, 0.1, 0.1]
     logits = logits_of(as_rows(features), alone)
     assert logits[0] < logits[1] == logits[2]
-    told = logits_of(as_rows(add_context(features, logits, weights)), in_context)
+    told = logits_of(as_rows(add_context(features, logits, borders)), in_context)
     assert is_uncertain(logits).tolist() == [False, True, True]
     assert (told[1:] > 0).tolist() == [False, True]
 
@@ -186,4 +186,4 @@ def test_samples_do_not_depend_on_the_number_of_processes() -> None:
     for one, two in zip(*(collect(SERIES, jobs) for jobs in (1, 2)), strict=True):
         assert np.array_equal(one.features, two.features)
         assert np.array_equal(one.objects, two.objects)
-        assert all(map(np.array_equal, one.weights, two.weights))
+        assert all(map(np.array_equal, one.borders, two.borders))

@@ -41,7 +41,7 @@ WELL_SEGMENTED_IOU = 0.75
 """Minimum IoU of a well segmented detection."""
 MOSTLY_VISIBLE = 0.7
 """Minimum visible fraction of a mostly visible object."""
-_TIMES = 3
+_PROCEDURAL_WEIGHT = 3
 """Weight of each procedural family of distractors; other kinds have weight 1."""
 
 
@@ -65,7 +65,7 @@ def options_of(name: str) -> ArrangementOptions:
     """Return the parameters of the arrangements of a set in `SETS`."""
     kinds = [kind for k, kind in enumerate(DISTRACTORS) if (k % 3 == 0) == (name == "test")]
     if name == "training":
-        kinds += _TIMES * list(PROCEDURAL)
+        kinds += _PROCEDURAL_WEIGHT * list(PROCEDURAL)
     return ArrangementOptions(SETS[name][0], tuple(kinds), background=True, **_SHARES[name])
 
 

@@ -49,7 +49,7 @@ _THIN_M = 0.03
 """Maximum height of background that counts as *unknown*. Higher background may have the shape of a
 category: a cupboard is a box."""
 _HEIGHT = DESCRIPTOR_NAMES.index("metric.height")
-_DETECTED = 0.75
+_DETECTED_SHARE = 0.75
 """Fraction of the detected objects whose view is their detection; others get their true pixels."""
 _FRAGMENTS = 0.3
 """Fraction of the views from which a partial view is cut in addition."""
@@ -200,7 +200,7 @@ def _views_of(
 ) -> list[SimulatedView]:
     """Return a view of object ``k``, segmented by truth or detection, and sometimes a fragment."""
     detected = _segment_by_detection(image, scene, k)
-    if detected is not None and rng.random() < _DETECTED:
+    if detected is not None and rng.random() < _DETECTED_SHARE:
         (view, overlap), source = detected, "detected"
     else:
         view, overlap = remove_base(_segment_by_truth(image, k, item, rng), rng), 1.0

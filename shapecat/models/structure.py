@@ -141,12 +141,12 @@ class Samples(NamedTuple):
     ----------
     features : (n,) records of `OBJECT_FEATURES`.
     objects : (n,) whether each segment shows an object.
-    weights : for each frame, the border lengths of its segments, from `measure_borders`.
+    borders : for each frame, the border lengths of its segments, from `measure_borders`.
     """
 
     features: Records
     objects: Bool
-    weights: tuple[F4, ...]
+    borders: tuple[F4, ...]
 
 
 @click.command()
@@ -203,10 +203,10 @@ def _in_context(samples: Samples, logits: F4) -> F4:
 
     ``logits`` (n,) are those of the trees that classify each segment alone.
     """
-    stops = np.cumsum([0, *(weights.shape[1] for weights in samples.weights)])
+    stops = np.cumsum([0, *(borders.shape[1] for borders in samples.borders)])
     frames = [
-        add_context(samples.features[a:b], logits[a:b], weights)
-        for a, b, weights in zip(stops[:-1], stops[1:], samples.weights, strict=True)
+        add_context(samples.features[a:b], logits[a:b], borders)
+        for a, b, borders in zip(stops[:-1], stops[1:], samples.borders, strict=True)
     ]
     return as_rows(np.concatenate([np.zeros(0, CONTEXT_FEATURES), *frames]))
 
@@ -217,7 +217,7 @@ def _collect(series: Series) -> Samples:
     return Samples(
         np.concatenate([np.zeros(0, OBJECT_FEATURES), *(frame.features for frame in frames)]),
         np.concatenate([np.zeros(0, np.bool_), *(frame.objects for frame in frames)]),
-        tuple(chain.from_iterable(frame.weights for frame in frames)),
+        tuple(chain.from_iterable(frame.borders for frame in frames)),
     )
 
 
@@ -288,8 +288,8 @@ def label_objects(frame: Frame, pixel_labels: U1, object_labels: I4) -> Iterator
         known_cells, 1
     )
     roots = roots_of(segments)
-    weights = measure_borders(segments, roots)
-    yield Samples(features[roots], shares[roots] > _OBJECT, (weights,))
+    borders = measure_borders(segments, roots)
+    yield Samples(features[roots], shares[roots] > _OBJECT, (borders,))
 
 
 if __name__ == "__main__":
