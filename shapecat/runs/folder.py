@@ -54,7 +54,7 @@ _MADE = (
     *RUN_FILES,
 )
 
-_OF_OUTPUTS = "tracks.parquet"
+_OUTPUTS_LOCK = "tracks.parquet"
 """A file that a process locks while it writes outputs. No command replaces it in a finished run.
 The lock of the folder itself is for labels, which need not wait for outputs."""
 
@@ -161,7 +161,7 @@ def _replace(folder: Path, hidden: Path, marker: Marker) -> None:
     flush(hidden)
     if folder.exists():
         require_ours(folder, marker)
-        outputs = folder / _OF_OUTPUTS
+        outputs = folder / _OUTPUTS_LOCK
         with holding(outputs) if outputs.exists() else nullcontext():
             folder.rename(previous_path(folder))
     hidden.rename(folder)
@@ -236,7 +236,7 @@ def writing_outputs(folder: Path) -> Iterator[None]:
     OutputError : another process is writing them, or the folder is not a finished run.
     """
     try:
-        with holding(folder / _OF_OUTPUTS, wait=False):
+        with holding(folder / _OUTPUTS_LOCK, wait=False):
             yield
     except BusyError as error:
         msg = f"{folder}: another command is writing its outputs; wait for it and run this again"

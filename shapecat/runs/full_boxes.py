@@ -102,7 +102,7 @@ class FullBoxes:
                 fused = fuse_boxes(
                     views, view_weights(sighting.partial[picked]), track.posterior, categories
                 )
-                self._show(fused, sighting, part)
+                self._write_in_views(fused, sighting, part)
         return result
 
     def _sightings(self, tracks: Sequence[Track]) -> "list[_Sighting]":
@@ -126,7 +126,7 @@ class FullBoxes:
         sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)
         return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
 
-    def _show(self, fused: FusedBox, sighting: "_Sighting", result: F4) -> None:
+    def _write_in_views(self, fused: FusedBox, sighting: "_Sighting", result: F4) -> None:
         """Write the fused box of a track to ``result``, in the sensor frame of each of its views.
 
         ``result`` (frames, 13) holds the rows of the track in `of_tracks`.
