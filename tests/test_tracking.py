@@ -330,15 +330,24 @@ def test_repeatedly_hidden_object_is_one_track() -> None:
         ({"sizes": [[0.1, 0.1, 0.1], [0.3, 0.3, 0.3]]}, False),
         ({"posteriors": [[1, 0], [0, 1]]}, False),
         ({"scenes": [0, 1]}, False),
-        ({"sizes": [[0.1, 0.1, 0.1], [0.2, 0.2, 0.1]], "whole": [3, 20]}, True),  # seen partially
-        ({"sizes": [[0.2, 0.2, 0.1], [0.1, 0.1, 0.1]], "whole": [3, 20]}, False),  # but larger
-        ({"posteriors": [[1, 0], [0, 1]], "whole": [0, 20]}, True),  # partial views vary
+        (
+            {"sizes": [[0.1, 0.1, 0.1], [0.2, 0.2, 0.1]], "whole_views": [3, 20]},
+            True,
+        ),  # seen partially
+        (
+            {"sizes": [[0.2, 0.2, 0.1], [0.1, 0.1, 0.1]], "whole_views": [3, 20]},
+            False,
+        ),  # but larger
+        ({"posteriors": [[1, 0], [0, 1]], "whole_views": [0, 20]}, True),  # partial views vary
         ({"posteriors": [[1, 0], [0, 1]], "novelties": [0.5, 1.2]}, True),  # so do unknowns
-        ({"posteriors": [[1, 0], [0.3, 0.7]], "whole": [20, 3]}, True),  # at the same position
+        (
+            {"posteriors": [[1, 0], [0.3, 0.7]], "whole_views": [20, 3]},
+            True,
+        ),  # at the same position
         (  # but larger than the whole one
             {
                 "posteriors": [[1, 0], [0.3, 0.7]],
-                "whole": [20, 3],
+                "whole_views": [20, 3],
                 "sizes": [[0.1, 0.1, 0.1], [0.16, 0.1, 0.1]],
             },
             False,
@@ -347,7 +356,7 @@ def test_repeatedly_hidden_object_is_one_track() -> None:
         (
             {
                 "posteriors": [[1, 0], [0.3, 0.7]],
-                "whole": [20, 3],
+                "whole_views": [20, 3],
                 "start": [[0, 0, 0], [0.05, 0, 0]],
             },
             False,
@@ -381,7 +390,7 @@ def test_contradicting_fragments_are_not_joined(options: dict[str, Any], joined:
         "start_velocity": np.zeros((2, 3)),
         "end_velocity": np.zeros((2, 3)),
         "sizes": np.full((2, 3), 0.1),
-        "whole": [20, 20],
+        "whole_views": [20, 20],
         "posteriors": [[0.8, 0.2], [0.7, 0.3]],
         "cut": [[False, False], [False, False]],
         "novelties": [0.5, 0.5],
@@ -612,7 +621,7 @@ def test_common_motion_stabilises_detections_and_can_be_inverted(speed: float) -
     assert motion is not None
     still = motion.stabilised(hits).centers.reshape(80, 5, 3)
     assert still.std(axis=0).max() < 0.01
-    back = motion.moved(hits.rows, still.reshape(-1, 3))
+    back = motion.unstabilised(hits.rows, still.reshape(-1, 3))
     assert back == pytest.approx(hits.centers, abs=1e-6)
 
 
@@ -854,7 +863,7 @@ def test_fragment_is_joined_to_only_one_of_two_predecessors() -> None:
         "start_velocity": np.zeros((3, 3)),
         "end_velocity": np.zeros((3, 3)),
         "sizes": np.full((3, 3), 0.1),
-        "whole": [20, 20, 20],
+        "whole_views": [20, 20, 20],
         "posteriors": [[0.8, 0.2]] * 3,
         "cut": [[False, False]] * 3,
         "novelties": [0.5] * 3,

@@ -18,7 +18,7 @@ from shapecat.tracking.detection_table import DetectionTable
 from shapecat.tracking.false_tracks import _in_box
 from shapecat.tracking.pieces import _fit as fit_pieces
 from shapecat.tracking.pieces import _joint, _largest
-from shapecat.tracking.recording import _describe, _line, _needed
+from shapecat.tracking.recording import _describe, _hits_to_confirm, _line
 from shapecat.tracking.stitching import Fragments, _contradiction, _distances
 from shapecat.tracking.tracker import Tracker
 from tests.frame_detections import frame, gather, track_frames
@@ -41,7 +41,7 @@ def two_tracks(**changes: Any) -> tracker._Active:
         born_ns=np.array([0, 3 * SECOND]),
         seen_ns=np.array([4 * SECOND, 4 * SECOND + 70_000_000]),
         missed=np.array([0, 1]),
-        topics=np.array([0, 0]),
+        last_topic=np.array([0, 0]),
     )
     return replace(found, **changes)
 
@@ -75,7 +75,7 @@ def test_correction_is_kalman_update_with_running_means() -> None:
         np.log([[0.5, 0.4, 0.3], [0.17, 0.09, 0.11]]),
         np.array([[0.5, 0.5], [0.4, 0.6]]),
     )
-    found.seen_ns[:], found.topics[:] = 5 * SECOND, 3
+    found.seen_ns[:], found.last_topic[:] = 5 * SECOND, 3
     size_difference = np.abs(before.size[0] - found.size[1]).mean()
     tracker._correct(tracks, found, np.array([[0, 1]]), np.array([False, True]))
 
@@ -94,7 +94,7 @@ def test_correction_is_kalman_update_with_running_means() -> None:
     assert_allclose(tracks.posterior[0], [0.7 - rate * 0.3, 0.3 + rate * 0.3])
     assert tracks.hits.tolist() == [6, 2]
     assert tracks.missed.tolist() == [0, 1]
-    assert tracks.topics.tolist() == [3, 0]
+    assert tracks.last_topic.tolist() == [3, 0]
     assert tracks.seen_ns.tolist() == [5 * SECOND, before.seen_ns[1]]
     assert_allclose(tracks.position[1], before.position[1])
 
@@ -184,14 +184,14 @@ def test_needed_detections_depend_on_nearby_frames() -> None:
 
     hits = next(gather(frames))
     one, two = (
-        [_needed(hits, of_frames, row, 9) for row in range(len(frames))]
+        [_hits_to_confirm(hits, of_frames, row, 9) for row in range(len(frames))]
         for of_frames in (np.zeros_like(scenes), scenes)
     )
 
     assert one == [3, 3, 4, 2, 2, 3, 2]
     assert two == [3, 3, 3, 1, 2, 3, 2]
-    assert _needed(hits, scenes, 2, 3) == 3
-    assert _needed(hits, scenes, 1, 2) == 2
+    assert _hits_to_confirm(hits, scenes, 2, 3) == 3
+    assert _hits_to_confirm(hits, scenes, 1, 2) == 2
 
 
 def test_fragment_summarises_its_detections() -> None:
@@ -208,7 +208,7 @@ def test_fragment_summarises_its_detections() -> None:
     assert_allclose([found.first_ns, found.last_ns], [[0, 3e8], [2e8, 3e8]])
     assert found.cut.tolist() == [[True, True], [False, False]]
     assert _describe(hits, [np.array([1, 3])], np.zeros(4, int)).cut.tolist() == [[True, False]]
-    assert found.whole.tolist() == [1, 1]
+    assert found.whole_views.tolist() == [1, 1]
     assert found.scenes.tolist() == [4, 5]
     assert_allclose(found.sizes[:, 0], [0.11, 0.14], rtol=1e-6)  # of the whole views
     assert (found.start[0] < found.end[0])[:2].all()
@@ -224,7 +224,7 @@ def fragments(**changes: Any) -> Fragments:
         "start_velocity": np.array([[0.0, 0, 0], [0.12, 0.06, 0.02], [0, 0, 0]]),
         "end_velocity": np.array([[0.1, 0.14, -0.04], [0, 0, 0], [0, 0, 0]]),
         "sizes": np.full((3, 3), 0.1),
-        "whole": np.array([3, 9, 9]),
+        "whole_views": np.array([3, 9, 9]),
         "cut": np.zeros((3, 2), bool),
         "posteriors": np.full((3, 2), 0.5),
         "novelties": np.zeros(3),
@@ -388,7 +388,7 @@ def test_rotation_in_plane_is_rotation_about_up() -> None:
         expected = np.column_stack([moved.real, moved.imag, flat[:, 2]]) @ level
         still = points @ motion.rotations[k].T + motion.translations[k]
         assert_allclose(still, expected, atol=1e-12)
-        assert_allclose(motion.moved(np.full(7, k), still), points, atol=1e-12)
+        assert_allclose(motion.unstabilised(np.full(7, k), still), points, atol=1e-12)
         alone = CommonMotion(motion.rotations[k : k + 1], motion.translations[k : k + 1])
         boxes = frame(0, points, orientations=tilted.as_quat())
         back = alone.stabilised(next(gather([boxes])))

@@ -49,7 +49,7 @@ class CommonMotion:
                 orientations[block] = turned.as_quat()
         return replace(table, centers=centers, orientations=orientations)
 
-    def moved(self, rows: I4, places: F8) -> F8:
+    def unstabilised(self, rows: I4, places: F8) -> F8:
         """Transform ``places`` (k, 3), metres, back from the coordinate frame of the still objects.
 
         The result is in the coordinate frame of the detections in frames ``rows`` (k,).

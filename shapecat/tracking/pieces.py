@@ -52,11 +52,11 @@ def _count_fits(table: DetectionTable, tracks: Sequence[I4]) -> Counter[tuple[in
     ``tracks`` are the detections (n,) of each track.
     """
     owner, counts = table.track_of_each(tracks), Counter[tuple[int, int]]()
-    wholes = np.array([_wholes(table, track) for track in tracks])
+    whole_lengths = np.array([_whole_lengths_by_topic(table, track) for track in tracks])
     for block in table.blocks():
         pairs = _neighbours(table, owner, block)
         track_pairs, which = np.unique(np.sort(owner[pairs], axis=1), axis=0, return_inverse=True)
-        fits = _fit(table, pairs, wholes[owner[pairs], table.topics[table.rows[pairs]]])
+        fits = _fit(table, pairs, whole_lengths[owner[pairs], table.topics[table.rows[pairs]]])
         fitting = np.bincount(which.ravel()[fits], minlength=len(track_pairs))
         counts.update(dict(zip(map(tuple, track_pairs.tolist()), fitting.tolist(), strict=True)))
     return counts
@@ -66,16 +66,16 @@ def _where(mask: Bool) -> list[int]:
     return [int(k) for k in np.flatnonzero(mask)]
 
 
-def _wholes(table: DetectionTable, track: I4) -> F8:
+def _whole_lengths_by_topic(table: DetectionTable, track: I4) -> F8:
     """Return the whole object's lengths (topics, 3) as seen by each topic, metres; 0 if unseen."""
     topics = table.topics[table.rows[track]]
     result = np.zeros((len(table.names), 3))
     for topic in _where(np.bincount(topics) > 0):
-        result[topic] = _whole(table, track[topics == topic])
+        result[topic] = _whole_lengths(table, track[topics == topic])
     return result
 
 
-def _whole(table: DetectionTable, track: I4) -> F8:
+def _whole_lengths(table: DetectionTable, track: I4) -> F8:
     """Return the 75th percentile (3,) of the lengths of whole views, or of all if none is whole."""
     uncut = track[~table.partial[track]]
     lengths = sorted_sides(table.sizes[track if len(uncut) == 0 else uncut])
@@ -95,16 +95,16 @@ def _neighbours(table: DetectionTable, owner: I4, block: slice) -> I4:
     return np.asarray(pairs[np.lexsort(pairs.T)])
 
 
-def _fit(table: DetectionTable, pairs: I4, wholes: F8) -> Bool:
+def _fit(table: DetectionTable, pairs: I4, whole_lengths: F8) -> Bool:
     """Return the mask (p,) of pairs of detections (p, 2) that are pieces of one object.
 
-    ``wholes`` (p, 2, 3) are the lengths of the whole object, estimated from each of the two tracks.
-    The joint box of two pieces is no larger than the whole object, and neither piece fills it, as a
-    bowl with an object in it would.
+    ``whole_lengths`` (p, 2, 3) are the lengths of the whole object, estimated from each of the two
+    tracks. The joint box of two pieces is no larger than the whole object, and neither piece fills
+    it, as a bowl with an object in it would.
     """
     joint = np.minimum(_joint(table, pairs), _joint(table, pairs[:, ::-1]))
     lengths = sorted_sides(table.sizes[pairs.ravel()]).reshape(-1, 2, 3)
-    room = wholes * _SLACK + _SLACK_M
+    room = whole_lengths * _SLACK + _SLACK_M
     lacking = np.any(lengths.max(axis=1) < _LACKING * joint, axis=1)
     fitting = np.all(joint[:, None] <= room, axis=2)
     return np.asarray(lacking & np.any(fitting, axis=1))

@@ -55,7 +55,7 @@ def track_recording(
 
 
 @dataclass(frozen=True)
-class _Followed:
+class _TrackedStream:
     """A tracked stream: its detections, the detections of each track, and the common motion.
 
     If there is a common motion, it is removed from the detections.
@@ -69,14 +69,14 @@ class _Followed:
         return int(self.table.stamps(track[:1])[0])
 
 
-def _track_stream(table: DetectionTable, settings: TrackingSettings) -> _Followed:
+def _track_stream(table: DetectionTable, settings: TrackingSettings) -> _TrackedStream:
     """Track a stream; if its objects have a common motion, remove it and track again."""
     tracks = _follow(table, settings)
     motion = find_common_motion(table, tracks)
     if motion is not None:
         table = motion.stabilised(table)
         tracks = _follow(table, settings)
-    return _Followed(table.without_boxes(), tracks, motion)
+    return _TrackedStream(table.without_boxes(), tracks, motion)
 
 
 def _follow(table: DetectionTable, settings: TrackingSettings) -> list[I4]:
@@ -88,7 +88,8 @@ def _follow(table: DetectionTable, settings: TrackingSettings) -> list[I4]:
         for track in _groups(_associate(table, cuts, settings))
         for group in _without_gaps(table, track)
         if len(group)
-        and len(group) >= _needed(table, scenes, int(table.rows[group[0]]), settings.min_hits)
+        and len(group)
+        >= _hits_to_confirm(table, scenes, int(table.rows[group[0]]), settings.min_hits)
     ]
     chains = _groups(merge_fragments(_describe(table, fragments, scenes), settings))
     tracks = [np.sort(np.concatenate([fragments[k] for k in c])) for c in chains if len(c)]
@@ -147,7 +148,7 @@ def _describe(table: DetectionTable, fragments: Sequence[I4], scenes: I4) -> Fra
         start_velocity=np.reshape([velocity for _, velocity in starts], (n, 3)),
         end_velocity=np.reshape([velocity for _, velocity in ends], (n, 3)),
         sizes=np.reshape([_extent(table, f) for f in fragments], (n, 3)),
-        whole=np.array([np.sum(~table.partial[f]) for f in fragments], np.int32),
+        whole_views=np.array([np.sum(~table.partial[f]) for f in fragments], np.int32),
         cut=np.reshape([table.partial[f[[0, -1]]] for f in fragments], (n, 2)),
         posteriors=np.reshape([posterior for posterior, _ in fused], (n, -1 if n else 0)),
         novelties=np.array([novelty for _, novelty in fused]),
@@ -186,7 +187,7 @@ def _line(table: DetectionTable, detections: I4, at: int) -> tuple[F8, F8]:
     return mean - middle * velocity, velocity
 
 
-def _needed(table: DetectionTable, scenes: I4, row: int, min_hits: int) -> int:
+def _hits_to_confirm(table: DetectionTable, scenes: I4, row: int, min_hits: int) -> int:
     """Return the number of detections that confirm a track born in frame ``row``.
 
     That is ``min_hits``, or the number of frames of the same topic and scene within `_BURST_NS` of
@@ -204,7 +205,9 @@ def _needed(table: DetectionTable, scenes: I4, row: int, min_hits: int) -> int:
     return min(min_hits, frames_near)
 
 
-def _build_track(number: int, stream: _Followed, track: I4, settings: TrackingSettings) -> Track:
+def _build_track(
+    number: int, stream: _TrackedStream, track: I4, settings: TrackingSettings
+) -> Track:
     """Return a `Track` with id ``number`` and the detections with the indices ``track`` (n,)."""
     table = stream.table
     rows, source = table.frame_span(track, settings.max_missed_s)
@@ -220,7 +223,7 @@ def _build_track(number: int, stream: _Followed, track: I4, settings: TrackingSe
         frames=table.frames[rows],
         stamps_ns=table.stamps_ns[rows],
         detections=np.where(source, table.numbers[track][at], -1),
-        centers=places if stream.motion is None else stream.motion.moved(rows, places),
+        centers=places if stream.motion is None else stream.motion.unstabilised(rows, places),
         causal=causal(views, settings.fusion, weights)[at],
         posterior=posterior,
         confidence=float(posterior.max()),

@@ -36,7 +36,7 @@ class Fragments(Record):
     start, end : (f, 3) positions at these times, metres.
     start_velocity, end_velocity : (f, 3) velocities at these times, m/s.
     sizes : (f, 3) typical box lengths, metres.
-    whole : (f,) number of views that seem to show the whole object.
+    whole_views : (f,) number of views that seem to show the whole object.
     cut : (f, 2) whether the first and the last view are partial.
     posteriors : (f, c) fused posteriors.
     novelties : (f,) fused novelties; above 1, the posterior is meaningless.
@@ -50,7 +50,7 @@ class Fragments(Record):
     start_velocity: F8 = array("f 3", "f8")
     end_velocity: F8 = array("f 3", "f8")
     sizes: F8 = array("f 3", "f8")
-    whole: I4 = array("f", "i4")
+    whole_views: I4 = array("f", "i4")
     cut: Bool = array("f 2", "?")
     posteriors: F8 = array("f c", "f8")
     novelties: F8 = array("f", "f8")
@@ -90,8 +90,8 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
     limit = gate_radius(keys, settings.gate_m)
     # An object disappears at one side of an occluder and emerges at the other.
     hidden = 2 * gate_radius(keys, np.inf)
-    size_known = fragments.whole >= _KNOWN
-    vague = (fragments.whole == 0) | (fragments.novelties > 1)  # the posterior is meaningless
+    size_known = fragments.whole_views >= _KNOWN
+    vague = (fragments.whole_views == 0) | (fragments.novelties > 1)  # the posterior is meaningless
     links = []
     for i, after in enumerate(_successors(fragments, limit, settings)):
         within = np.where(fragments.cut[i, 1] & fragments.cut[after, 0], hidden[i], limit[i])

@@ -46,7 +46,7 @@ class _Active:
     born_ns: I4
     seen_ns: I4
     missed: I4  # number of frames of this sensor since the last detection
-    topics: I4  # number of the sensor that saw it last
+    last_topic: I4  # number of the sensor that saw it last
 
     def rows(self, which: Bool) -> Self:
         """Return the tracks selected by a mask."""
@@ -140,7 +140,7 @@ class Tracker:
         """
         elapsed_s = self._tick(stamp_ns)
         detections.born_ns[:] = detections.seen_ns[:] = self._clock_ns
-        detections.topics[:] = topic
+        detections.last_topic[:] = topic
         if self._active is None or not len(self._active.ids):
             self._active = detections.rows(np.zeros(len(detections.ids), bool))
         active = _predict(self._active, elapsed_s)
@@ -149,7 +149,7 @@ class Tracker:
             _LIMIT,
             self._settings.association,
         )
-        active.missed[active.topics == topic] += 1
+        active.missed[active.last_topic == topic] += 1
         _correct(active, detections, pairs, partial)
         new = np.ones(len(detections.ids), bool)
         new[pairs[:, 1]] = False
@@ -203,7 +203,7 @@ def _seed(centers: F8, size_keys: F8, posteriors: F8) -> _Active:
         born_ns=np.zeros(n, np.int64),
         seen_ns=np.zeros(n, np.int64),
         missed=np.zeros(n, np.int64),
-        topics=np.zeros(n, np.int64),
+        last_topic=np.zeros(n, np.int64),
     )
 
 
@@ -255,7 +255,7 @@ def _correct(tracks: _Active, detections: _Active, pairs: I4, partial: Bool) -> 
     detections are partial views.
     """
     i, j = pairs.T
-    tracks.missed[i], tracks.topics[i] = 0, detections.topics[j]
+    tracks.missed[i], tracks.last_topic[i] = 0, detections.last_topic[j]
     tracks.seen_ns[i] = detections.seen_ns[j]
     tracks.hits[i] += 1
     # A view of another size shows another part of the object, so its centre is less reliable.
