@@ -88,7 +88,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
         categorizer.require_descriptor(DESCRIPTOR_NAMES)
         require_model(job, categorizer)
         run = describe_run(job, categorizer)
-        _require_begun(job, recording)
+        _require_start_in_recording(job, recording)
         streams = choose_streams(recording, job.topics)
         run["options"]["topics"] = [stream.topic for stream in streams]
         colours = pair_colours(recording, streams, job.color)
@@ -135,7 +135,7 @@ def _run_phases(work: Work, content: ContentDigest, begun: float) -> None:
     write_run(folder, run)
 
 
-def _require_begun(job: Job, recording: Recording) -> None:
+def _require_start_in_recording(job: Job, recording: Recording) -> None:
     """Check that the selected range begins within the recording.
 
     Raises

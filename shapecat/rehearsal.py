@@ -224,7 +224,7 @@ def _rehearse(
         return
     executor = LocalExecutor(min(cores, len(_REHEARSALS)))
     try:
-        waiting = {executor.submit(_uncollected, rehearsal) for rehearsal in rehearsals}
+        waiting = {executor.submit(_call_without_gc, rehearsal) for rehearsal in rehearsals}
         while waiting:
             stopping.check()
             report(COMPILE)
@@ -235,7 +235,7 @@ def _rehearse(
         executor.terminate()
 
 
-def _uncollected(rehearsal: Callable[[], object]) -> None:
+def _call_without_gc(rehearsal: Callable[[], object]) -> None:
     """Call ``rehearsal`` without garbage collection, a twelfth faster; for short-lived workers."""
     gc.disable()
     rehearsal()
