@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from shapecat.outputs.annotation.annotated_mcap import write_annotated
-from shapecat.outputs.annotation.channels import encoder_for, text_position
+from shapecat.outputs.annotation.channels import annotation_encoders, text_position
 from shapecat.outputs.annotation.content import Annotation, AnnotationChannel
 from shapecat.outputs.annotation.image_annotations import ImageBox, ImageFrame, image_encoders_for
 from shapecat.outputs.colours import colour_of
@@ -77,7 +77,7 @@ def read_back(channel: AnnotationChannel, data: bytes) -> Any:
 
 def messages(encoding: str) -> dict[str, Any]:
     """Return the message of each topic."""
-    encoders = encoder_for(encoding, markers=True)
+    encoders = annotation_encoders(encoding, markers=True)
     return {channel.topic: read_back(channel, make(ANNOTATION)) for channel, make in encoders}
 
 
@@ -234,7 +234,7 @@ def test_unordered_messages_are_found_by_time(tmp_path: Path) -> None:
 
 def test_stamps_beyond_ros_range_are_clamped() -> None:
     """ROS seconds have 31 bits: larger stamps must not stop the writer."""
-    channel, make = encoder_for("cdr", markers=False)[0]
+    channel, make = annotation_encoders("cdr", markers=False)[0]
     for seconds, written in ((2**31 - 2, 2**31 - 2), (2**31, 2**31 - 1), (9 * 10**9, 2**31 - 1)):
         frame = replace(FRAME, stamp_ns=seconds * SECOND + 7, objects=())
         made = read_back(channel, make(Annotation(frame, SECOND, ())))

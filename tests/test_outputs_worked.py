@@ -26,7 +26,7 @@ from shapecat.colour.masks import Mask
 from shapecat.errors import OutputError, RecordingError
 from shapecat.geometry import IDENTITY
 from shapecat.outputs.annotation.annotated_mcap import _annotations, _encoding
-from shapecat.outputs.annotation.channels import encoder_for
+from shapecat.outputs.annotation.channels import annotation_encoders
 from shapecat.outputs.annotation.content import Annotation
 from shapecat.outputs.annotation.image_annotations import ImageBox, read_image_frames
 from shapecat.outputs.colouring import Coloured, with_colour
@@ -38,7 +38,7 @@ from shapecat.outputs.exports.dataset_frames import (
     _colour_file,
     _depth_file,
     _different,
-    _view,
+    _view_features,
     image_stems,
     images_of,
     snapped_masks,
@@ -59,7 +59,7 @@ from shapecat.outputs.report.cards import _guess
 from shapecat.outputs.report.pictures import _frames, _require_unchanged
 from shapecat.outputs.review.colour import true_colours
 from shapecat.outputs.review.columns import At
-from shapecat.outputs.review.images import layer_of
+from shapecat.outputs.review.images import mask_layer
 from shapecat.outputs.review.paths import Paths
 from shapecat.outputs.review.scenes import choose_scenes, with_clouds
 from shapecat.outputs.scene_graph import Node, format_tree
@@ -220,7 +220,7 @@ def test_lifetime_does_not_span_jump_of_clock(encoding: str) -> None:
     ]
     for annotation in _annotations(frames):
         assert annotation.lifetime_ns == 5400 * 10**9
-        for _, encode in encoder_for(encoding, markers=True):
+        for _, encode in annotation_encoders(encoding, markers=True):
             assert encode(annotation)
 
 
@@ -548,12 +548,12 @@ def test_view_vector_has_direction_distance_size_and_shape() -> None:
     direction, size = np.array([-0.36, 0.48, -0.8]), np.array([0.12, 0.07, 0.24])
     item = labelled_object(1, range(55), box=box_at(-1.7 * direction, size))
     frame = replace(labelled_frame(0, item), fixed_from_sensor=Pose(R.as_matrix(), np.zeros(3)))
-    found = _view(frame, item)
+    found = _view_features(frame, item)
 
     assert_allclose(found[:3], R.apply(direction), atol=1e-6)
     assert_allclose(found[3:5], [np.log(1.7), 0.3 * np.log(55)], atol=1e-6)
     assert_allclose(found[5:], [0.25, 0.07 / 0.48, 0.5], atol=1e-6)
-    assert_allclose(_view(labelled_frame(0, item), item)[:3], direction, atol=1e-6)
+    assert_allclose(_view_features(labelled_frame(0, item), item)[:3], direction, atol=1e-6)
 
 
 def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1021,7 +1021,7 @@ def test_overlay_with_many_categories_shows_all_masks_in_their_colours() -> None
     names = [f"kind {'abcdefghijklmnopqrst'[k]}" for k in range(20)]
     objects = [labelled_object(k, [k], category=name) for k, name in enumerate(names)]
     masks = tuple(Mask(k + 1, 1, np.ones((1, 1), bool)) for k in range(len(names)))
-    layer = layer_of(list(zip(objects, masks, strict=True)), 3, 23)
+    layer = mask_layer(list(zip(objects, masks, strict=True)), 3, 23)
     overlay = np.asarray(Image.open(io.BytesIO(layer)).convert("RGBA"))
 
     assert np.argwhere(overlay[..., 3]).tolist() == [[1, k + 1] for k in range(len(names))]

@@ -15,7 +15,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from shapecat.outputs.annotation.channels import encoder_for
+from shapecat.outputs.annotation.channels import annotation_encoders
 from shapecat.outputs.annotation.content import (
     Annotation,
     AnnotationChannel,
@@ -117,7 +117,7 @@ def _encoded(
     annotations = _annotations(frames)
     first = next(annotations, None)
     encoding = _encoding(recording, first)
-    kinds = encoder_for(encoding, markers=markers)
+    kinds = annotation_encoders(encoding, markers=markers)
     channels = [channel for channel, _ in kinds]
     all_annotations = chain([first] if first else [], annotations)
     items = chain.from_iterable(_messages(one, kinds, 0) for one in all_annotations)

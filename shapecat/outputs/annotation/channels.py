@@ -8,10 +8,10 @@ from shapecat.outputs.colours import colour_of
 from shapecat.outputs.wording import caption
 from shapecat.types import AnnotationBox
 
-__all__ = ["encoder_for", "text_position"]
+__all__ = ["annotation_encoders", "text_position"]
 
 
-def encoder_for(encoding: str, *, markers: bool) -> Encoders[Annotation]:
+def annotation_encoders(encoding: str, *, markers: bool) -> Encoders[Annotation]:
     """Return the annotation channels for an encoding, each with its encoder.
 
     An unknown encoding is replaced by JSON. ``markers`` adds a channel for RViz if the encoding

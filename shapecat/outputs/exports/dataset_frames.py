@@ -240,7 +240,11 @@ def _chosen(
             apart = abs(labelled.stamp_ns - image.stamp_ns)
         if place not in best or apart < best[place][0]:
             sure = (o for o in labelled.objects if _is_sure(o, selection, corrected))
-            views = [(o.track, _view(labelled, o)) for o in sure] if selection.per_track else []
+            views = (
+                [(o.track, _view_features(labelled, o)) for o in sure]
+                if selection.per_track
+                else []
+            )
             best[place] = apart, key, views
     if not selection.per_track:
         return {key for _, key, _ in best.values()}
@@ -264,7 +268,7 @@ def thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFra
         counts[frame.topic] += 1
 
 
-def _view(labelled: LabelledFrame, item: LabelledObject) -> F8:
+def _view_features(labelled: LabelledFrame, item: LabelledObject) -> F8:
     """Return features (8,) of a view, scaled so that their differences are comparable.
 
     They are the direction to the sensor (3), the logarithms of distance and number of pixels, and
@@ -282,7 +286,8 @@ def _view(labelled: LabelledFrame, item: LabelledObject) -> F8:
 def _different(views: F8, count: int) -> list[int]:
     """Return the indices of up to ``count`` views that differ most, by farthest-point sampling.
 
-    ``views`` (n, 8) are from `_view`. The first to be chosen is the one with the most pixels.
+    ``views`` (n, 8) are from `_view_features`. The first to be chosen is the one with the most
+    pixels.
     """
     chosen = [int(views[:, 4].argmax())]
     apart = np.linalg.norm(views - views[chosen[0]], axis=1)

@@ -46,7 +46,7 @@ def true_colours(
         pixels_in_image = project(points, view.lens, view.colour_from_depth)
         _hide(pixels_in_image, (image.height, image.width), max(4.0, apart), 1 - _HIDDEN)
     colours = pixels_of(image, shrink=shrink)
-    _take(colours, (image.height, image.width), pixels_in_image, palette, tones, result)
+    _sample_colours(colours, (image.height, image.width), pixels_in_image, palette, tones, result)
     return result
 
 
@@ -81,7 +81,7 @@ def _hide(projected: F4, shape: tuple[int, int], cell: float, share: float) -> N
 
 
 @kernel
-def _take(
+def _sample_colours(
     image: U1, shape: tuple[int, int], projected: F4, palette: U1, tones: U2, colours: U4
 ) -> None:
     """Write the colours of visible points, 0xRRGGBBAA, into ``colours`` (n,).

@@ -17,7 +17,7 @@ from shapecat.outputs.review.shapes import short_label
 from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.types import LabelledFrame, LabelledObject
 
-__all__ = ["Images", "layer_of"]
+__all__ = ["Images", "mask_layer"]
 
 _QUALITY = 85
 _OPACITY = 110
@@ -40,7 +40,7 @@ def _file_of(image: ColourImage) -> tuple[bytes, str]:
     return file.getvalue(), "image/jpeg"
 
 
-def layer_of(visible: Sequence[tuple[LabelledObject, Mask]], height: int, width: int) -> bytes:
+def mask_layer(visible: Sequence[tuple[LabelledObject, Mask]], height: int, width: int) -> bytes:
     """Return the masks on an image of this size, in pixels, as a translucent PNG.
 
     Rerun would not compress a segmentation image.
@@ -82,7 +82,7 @@ class Images:
             for item, mask in zip(labelled.objects, coloured.masks, strict=True)
             if mask.pixels.size
         ]
-        masks = layer_of(visible, image.height, image.width), "image/png"
+        masks = mask_layer(visible, image.height, image.width), "image/png"
         entity = rr.new_entity_path(["images", labelled.topic])
         for name, file, drawing in (("", _file_of(image), _IMAGE), ("/masks", masks, _MASKS)):
             size = len(file[0]) // _BYTES_PER_NUMBER

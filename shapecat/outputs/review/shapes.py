@@ -27,7 +27,7 @@ from shapecat.types import Box, Camera, LabelledFrame, LabelledObject, Pose
 
 __all__ = [
     "PATHS",
-    "PLACES",
+    "POSES",
     "SCENE",
     "SKETCH",
     "DrawnScene",
@@ -47,22 +47,22 @@ _DASHES = (np.arange(5)[:, None] + [0.0, 0.5])[..., None] / 4.5
 """Start and end (5, 2, 1) of the dashes of an edge, as fractions of its length, from 0 to 1."""
 
 _Columns = Iterable[rr.ComponentColumn]
-_Way = tuple[str, F8]
+_TrackPath = tuple[str, F8]
 """The category of a track and its path (n, 3), metres."""
 
 
 class DrawnScene(NamedTuple):
-    """A frame to draw; ``scene`` holds the points on no object, ``points`` those on objects."""
+    """A frame to draw; ``points`` are those on objects, ``rest`` are all others."""
 
     labelled: LabelledFrame
-    scene: PaintedCloud
+    rest: PaintedCloud
     points: PaintedCloud
 
     @property
     def size(self) -> int:
         """The number of points plus the number of pixels in the ``indices`` of the objects."""
         pixels = sum(o.indices.size for o in self.labelled.objects)
-        return len(self.scene.points) + len(self.points.points) + pixels
+        return len(self.rest.points) + len(self.points.points) + pixels
 
 
 class Sketch(NamedTuple):
@@ -207,7 +207,7 @@ def _faces(meshes: Sequence[U4]) -> rr.ComponentColumn:
 # The colours of points are shaded already.
 _FLAT = rr.Points3D.from_fields(point_shading=rr.components.PointShading.Flat)
 SCENE: Mapping[str, Drawing] = {
-    "scene": Drawing(lambda scenes: _points([moment.scene for moment in scenes]), _FLAT),
+    "scene": Drawing(lambda scenes: _points([moment.rest for moment in scenes]), _FLAT),
     "objects/points": Drawing(lambda scenes: _points([moment.points for moment in scenes]), _FLAT),
     "planes": Drawing(_outlines, rr.LineStrips3D.from_fields(colors=_PLANE, radii=0.001)),
     "planes/fill": Drawing(_fills, rr.Mesh3D.from_fields(albedo_factor=(*_PLANE, 28))),
@@ -224,7 +224,7 @@ SKETCH: Mapping[str, Drawing] = {
 """The `Drawing` of each entity that is drawn in every frame, from a `Sketch` of each object."""
 
 
-def _paths(snapshots: Sequence[Sequence[_Way]]) -> _Columns:
+def _paths(snapshots: Sequence[Sequence[_TrackPath]]) -> _Columns:
     strips = [way for snapshot in snapshots for way in snapshot]
     yield from rr.LineStrips3D.columns(
         strips=[places for _, places in strips],
@@ -232,14 +232,14 @@ def _paths(snapshots: Sequence[Sequence[_Way]]) -> _Columns:
     ).partition([len(snapshot) for snapshot in snapshots])
 
 
-def _places(poses: Sequence[Pose]) -> _Columns:
+def _poses(poses: Sequence[Pose]) -> _Columns:
     yield from rr.Transform3D.columns(
         translation=[pose.translation for pose in poses],
         quaternion=[quaternion_from_rotation(pose.rotation) for pose in poses],
     )
 
 
-PATHS, PLACES = Drawing(_paths), Drawing(_places)
+PATHS, POSES = Drawing(_paths), Drawing(_poses)
 """The `Drawing` of the paths of tracks, and of poses ``parent_from_child``."""
 
 

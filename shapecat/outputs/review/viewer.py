@@ -48,7 +48,7 @@ def open_viewer(path: Path) -> None:
         viewer = _start(("--port", "auto", str(path.absolute())), log)
         with suppress(subprocess.TimeoutExpired):
             if viewer.wait(_OPEN_S) != 0:
-                raise OutputError(_why(log))
+                raise OutputError(_failure_text(log))
 
 
 @contextmanager
@@ -115,7 +115,7 @@ def take_screenshot(path: Path, png: Path) -> None:
             _save(client, png, viewer)
         except (RuntimeError, OSError) as error:
             ended = _has_ended(viewer)
-            msg = _why(log) if ended else f"{path}: the viewer cannot draw it: {error}"
+            msg = _failure_text(log) if ended else f"{path}: the viewer cannot draw it: {error}"
             raise OutputError(msg) from error
         finally:
             _end(viewer)
@@ -192,7 +192,7 @@ def _wait_for(viewer: subprocess.Popen[bytes], port: int, log: IO[bytes]) -> Non
 
     def answers() -> bool:
         if viewer.poll() is not None:
-            raise OutputError(_why(log))
+            raise OutputError(_failure_text(log))
         with socket.socket() as probe:
             return probe.connect_ex((_HERE, port)) == 0
 
@@ -213,7 +213,7 @@ def _has_ended(viewer: subprocess.Popen[bytes]) -> bool:
     return viewer.poll() is not None
 
 
-def _why(log: IO[bytes]) -> str:
+def _failure_text(log: IO[bytes]) -> str:
     log.seek(0)
     text = log.read().decode("utf-8", "replace")
     if panic := re.search(r" panicked at '(.*)'$", text, re.MULTILINE):

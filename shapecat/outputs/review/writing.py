@@ -61,7 +61,7 @@ from shapecat.outputs.review.layout import (
 )
 from shapecat.outputs.review.paths import Paths
 from shapecat.outputs.review.scenes import ReviewFrame
-from shapecat.outputs.review.shapes import PLACES, SCENE, SKETCH, DrawnScene
+from shapecat.outputs.review.shapes import POSES, SCENE, SKETCH, DrawnScene
 from shapecat.recordings import MessageError
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.run_info import RunInfo
@@ -168,7 +168,7 @@ class _Review:
             self._draw_scene(entity, labelled, *self._paint(chosen, frame))
         at, pose = (labelled.stamp_ns, labelled.index), self._pose(labelled)
         if pose is not None:
-            self._columns.add(entity, at, pose, PLACES)
+            self._columns.add(entity, at, pose, POSES)
         sketch = shapes.sketch(labelled)
         for name, drawing in SKETCH.items():
             self._columns.add(f"{entity}/{name}", at, sketch, drawing, size=64)
@@ -222,7 +222,7 @@ class _Review:
         at = (labelled.stamp_ns, labelled.index)
         if self._fixed_frame is not None:
             entity = rr.new_entity_path(["world", "seen", labelled.topic])
-            self._columns.add(entity, at, self._pose(labelled) or IDENTITY, PLACES)
+            self._columns.add(entity, at, self._pose(labelled) or IDENTITY, POSES)
         scene = DrawnScene(labelled, rest, points)
         for name, drawing in SCENE.items():
             self._columns.add(f"{entity}/{name}", at, scene, drawing, size=scene.size)
