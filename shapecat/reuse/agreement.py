@@ -34,10 +34,10 @@ def agreement(
     there or none agrees.
     """
     # Writable, in C order, so that the kernel is compiled only once.
-    turn = np.array(other_from_one.rotation, order="C")
-    shift = other_from_one.translation
+    rotation = np.array(other_from_one.rotation, order="C")
+    translation = other_from_one.translation
     compared, agreeing, total = _compare(
-        pixels, depth, _numbers(camera), other, _numbers(other_camera), turn, shift
+        pixels, depth, _numbers(camera), other, _numbers(other_camera), rotation, translation
     )
     sampled = -(-len(pixels) // _step(len(pixels)))
     if not agreeing or compared < _KNOWN * sampled:
@@ -63,8 +63,8 @@ def _compare(
     camera: tuple[float, float, float, float],
     other: F4,
     other_camera: tuple[float, float, float, float],
-    turn: F8,
-    shift: F8,
+    rotation: F8,
+    translation: F8,
 ) -> tuple[int, int, float]:
     """Return the numbers of compared and agreeing points, and the latter's summed differences, 1/m.
 
@@ -73,7 +73,7 @@ def _compare(
     pixels : (n,) flat indices of the points in ``depth``.
     depth, other : (h, w) metres, the image with the points and the image to compare with.
     camera, other_camera : fx, fy, cx, cy, pixels.
-    turn, shift : rotation (3, 3) and translation (3,), metres, of ``other_from_one``.
+    rotation, translation : rotation (3, 3) and translation (3,), metres, of ``other_from_one``.
     """
     fx, fy, cx, cy = camera
     gx, gy, ax, ay = other_camera
@@ -85,9 +85,9 @@ def _compare(
         if z <= 0:
             continue
         x, y = (u - cx) / fx * z, (v - cy) / fy * z
-        a = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z + shift[0]
-        b = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z + shift[1]
-        c = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z + shift[2]
+        a = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
+        b = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
+        c = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
         if c < NEAREST_M:
             compared += 1
             continue

@@ -63,7 +63,7 @@ def _changed(depth: F4, key_depth: F4, range_m: float) -> bool:
         _mark(depth[v], key_depth[v], range_m, differs)
         run = 0
         for u in range(0, width, _STRIDE):
-            run = run + 1 if differs[u] and _alone(depth, key_depth, v, u) else 0
+            run = run + 1 if differs[u] and _is_unmatched(depth, key_depth, v, u) else 0
             rows[u] = rows[u] + 1 if run >= _SQUARE else 0
             if rows[u] == _SQUARE:
                 return True
@@ -83,7 +83,7 @@ def _mark(depth: F4, key_depth: F4, range_m: float, differs: Bool) -> None:
 
 
 @kernel(inline=True)
-def _alone(depth: F4, key_depth: F4, row: int, column: int) -> bool:
+def _is_unmatched(depth: F4, key_depth: F4, row: int, column: int) -> bool:
     """Return whether neither image has the depth of the other at a pixel or beside it.
 
     If both depths are missing, the result is False. The images are as in `_changed`.
