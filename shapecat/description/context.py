@@ -137,7 +137,7 @@ def context(
     out[30] = 1.0 / (1.0 + size)
     out[31] = min(max((middle - low) / max(high - low, 1e-3), -2.0), 3.0)
     _heights(rise, weight, curvatures, out[32:36])
-    _around(surface.euclidean, surface.geodesic, out[36:39])
+    _distance_ratios(surface.euclidean, surface.geodesic, out[36:39])
     out[39] = _ratio(max(low - base, 0.0), high - low)
     return wide, across, along
 
@@ -307,7 +307,7 @@ def _heights(rise: F8, weight: F4, curvatures: F4, out: F4) -> None:
 
 
 @kernel(inline=True)
-def _around(euclidean: F4, geodesic: F4, out: F4) -> None:
+def _distance_ratios(euclidean: F4, geodesic: F4, out: F4) -> None:
     """Write ratios of the distances between neurons to ``out`` (3,).
 
     They are mean geodesic to mean Euclidean distance, at most 4; largest to mean geodesic distance;

@@ -46,7 +46,7 @@ def geodesic_distances(euclidean: F4, edges: U2) -> F4:
         paths[i, i] = 0
     via = np.zeros((4, padded), np.float32)
     for k in range(0, count, 4):  # four nodes at a time: each row is read and written only once
-        _ways(paths, k, via)
+        _paths_from_block(paths, k, via)
         for i in range(count):
             _shorten(paths, i, via, k)
     joined: F4 = _joined(paths, euclidean)
@@ -54,13 +54,13 @@ def geodesic_distances(euclidean: F4, edges: U2) -> F4:
 
 
 @kernel(fast=True, inner=True)
-def _less(a: float, b: float) -> float:
+def _minimum(a: float, b: float) -> float:
     """Return the smaller of two numbers, in a form that vectorises."""
     return a if a < b else b
 
 
 @kernel(fast=True, inline=True)
-def _ways(paths: F4, k: int, via: F4) -> None:
+def _paths_from_block(paths: F4, k: int, via: F4) -> None:
     """Write the path lengths from each of the nodes k to k + 3 to ``via``.
 
     ``paths`` (n, n) are the lengths so far, ``via`` is (4, n). A path from node k + m may pass
@@ -69,16 +69,16 @@ def _ways(paths: F4, k: int, via: F4) -> None:
     first, second, third, fourth = paths[k], paths[k + 1], paths[k + 2], paths[k + 3]
     a = second[k]
     b = third[k]
-    c = _less(third[k + 1], b + first[k + 1])
+    c = _minimum(third[k + 1], b + first[k + 1])
     d = fourth[k]
-    e = _less(fourth[k + 1], d + first[k + 1])
-    f = _less(fourth[k + 2], d + first[k + 2])
-    f = _less(f, e + _less(second[k + 2], a + first[k + 2]))
+    e = _minimum(fourth[k + 1], d + first[k + 1])
+    f = _minimum(fourth[k + 2], d + first[k + 2])
+    f = _minimum(f, e + _minimum(second[k + 2], a + first[k + 2]))
     for j in range(first.size):
         w0 = first[j]
-        w1 = _less(second[j], a + w0)
-        w2 = _less(_less(third[j], b + w0), c + w1)
-        w3 = _less(_less(_less(fourth[j], d + w0), e + w1), f + w2)
+        w1 = _minimum(second[j], a + w0)
+        w2 = _minimum(_minimum(third[j], b + w0), c + w1)
+        w3 = _minimum(_minimum(_minimum(fourth[j], d + w0), e + w1), f + w2)
         via[0, j], via[1, j], via[2, j], via[3, j] = w0, w1, w2, w3
 
 
@@ -86,18 +86,18 @@ def _ways(paths: F4, k: int, via: F4) -> None:
 def _shorten(paths: F4, i: int, via: F4, k: int) -> None:
     """Route the paths of node i through the nodes k to k + 3 where that is shorter.
 
-    ``paths`` (n, n) is changed in place; ``via`` (4, n) is from `_ways`.
+    ``paths`` (n, n) is changed in place; ``via`` (4, n) is from `_paths_from_block`.
     """
     a = paths[i, k]
-    b = _less(paths[i, k + 1], a + via[0, k + 1])
-    c = _less(_less(paths[i, k + 2], a + via[0, k + 2]), b + via[1, k + 2])
-    d = _less(_less(paths[i, k + 3], a + via[0, k + 3]), b + via[1, k + 3])
-    d = _less(d, c + via[2, k + 3])
+    b = _minimum(paths[i, k + 1], a + via[0, k + 1])
+    c = _minimum(_minimum(paths[i, k + 2], a + via[0, k + 2]), b + via[1, k + 2])
+    d = _minimum(_minimum(paths[i, k + 3], a + via[0, k + 3]), b + via[1, k + 3])
+    d = _minimum(d, c + via[2, k + 3])
     for j in range(paths.shape[1]):
-        best = _less(paths[i, j], a + via[0, j])
-        best = _less(best, b + via[1, j])
-        best = _less(best, c + via[2, j])
-        paths[i, j] = _less(best, d + via[3, j])
+        best = _minimum(paths[i, j], a + via[0, j])
+        best = _minimum(best, b + via[1, j])
+        best = _minimum(best, c + via[2, j])
+        paths[i, j] = _minimum(best, d + via[3, j])
 
 
 @kernel(fast=True, inline=True)

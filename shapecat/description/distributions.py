@@ -45,11 +45,14 @@ def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
 
 
 @kernel(inner=True)
-def _find_bins(lengths: F4, i: int, scale: float, one: float, bins: I4, shares: F4) -> None:
+def _find_bins(
+    lengths: F4, i: int, scale: float, distance_weight: float, bins: I4, shares: F4
+) -> None:
     """Split each length in row i between the two nearest bins of a histogram.
 
     Writes the first bin of each to ``bins`` (n,), and the weight of the second to ``shares`` (n,);
-    both weights add up to ``one``. ``lengths`` is (n, n), ``scale`` is bins per unit of length.
+    both weights add up to ``distance_weight``. ``lengths`` is (n, n), ``scale`` is bins per unit of
+    length.
     """
     last = np.float32(DISTANCE_BINS - 1)
     for j in range(lengths.shape[1]):
@@ -58,7 +61,7 @@ def _find_bins(lengths: F4, i: int, scale: float, one: float, bins: I4, shares: 
         place = place if place < last else last
         k = min(np.int32(place), np.int32(DISTANCE_BINS - 2))
         bins[j] = k
-        shares[j] = (place - np.float32(k)) * one
+        shares[j] = (place - np.float32(k)) * distance_weight
 
 
 @kernel
@@ -85,20 +88,20 @@ def distributions(surface: Surface, normals: F4, curvatures: F4, out: F4) -> Non
     scale = np.float32(DISTANCE_BINS / _DISTANCE_RANGE)
     per_geodesic = scale * np.float32(pairs / max(total, 1e-9))
     per_euclidean = scale  # the mean is the unit
-    one = np.float32(1.0 / (count - 1))
+    distance_weight = np.float32(1.0 / (count - 1))
     bins, shares = np.zeros((2, count), np.int32), np.zeros((2, count), np.float32)
     for i in range(count):
         row = rows[i]
-        _find_bins(geodesic, i, per_geodesic, one, bins[0], shares[0])
-        _find_bins(euclidean, i, per_euclidean, one, bins[1], shares[1])
+        _find_bins(geodesic, i, per_geodesic, distance_weight, bins[0], shares[0])
+        _find_bins(euclidean, i, per_euclidean, distance_weight, bins[1], shares[1])
         for j in range(count):
             if i == j:
                 continue
             k, share = 1 + _CURVATURE + bins[0, j], shares[0, j]
-            row[k] += one - share
+            row[k] += distance_weight - share
             row[k + 1] += share
             k, share = 1 + _CURVATURE + DISTANCE_BINS + bins[1, j], shares[1, j]
-            row[k] += one - share
+            row[k] += distance_weight - share
             row[k + 1] += share
         first, second = curvatures[0, i], curvatures[1, i]
         _curvature_row(row, first, second)

@@ -98,7 +98,7 @@ def fit_axis(neurons: F4, weight: F4, normals: F4, axis: F8, point: F8, free: in
 
 
 @kernel
-def _across(axis: F8) -> tuple[F8, F8]:
+def _perpendicular_axes(axis: F8) -> tuple[F8, F8]:
     """Return two unit vectors (3,) that form a right-handed frame with ``axis`` (3,)."""
     small = 0
     for j in range(1, 3):
@@ -114,16 +114,16 @@ def _across(axis: F8) -> tuple[F8, F8]:
 
 
 @kernel
-def _place(
+def _cylindrical_coordinates(
     cloud: F4, owner: I4, normals: F4, axis: F8, point: F8, first: F8, second: F8
 ) -> tuple[F8, F8]:
     """Return cylindrical coordinates (5, n) about the axis, and the range (2,) along it.
 
     The rows of the coordinates are the position along the axis, the radius, two components (along
-    ``first`` and ``second``, from `_across`) of the radial unit vector, and a weight, the fourth
-    power of the sine of the angle between normal and axis. ``owner`` (n,) is the neuron of each
-    point of ``cloud`` (3, n), ``normals`` (3, k) are those of the neurons. The axis has the unit
-    direction ``axis`` and contains ``point``.
+    ``first`` and ``second``, from `_perpendicular_axes`) of the radial unit vector, and a weight,
+    the fourth power of the sine of the angle between normal and axis. ``owner`` (n,) is the neuron
+    of each point of ``cloud`` (3, n), ``normals`` (3, k) are those of the neurons. The axis has the
+    unit direction ``axis`` and contains ``point``.
     """
     rows = np.zeros((5, cloud.shape[1]))
     extent = np.zeros(2)
@@ -158,9 +158,9 @@ def _improve(
 
     The parameters are as in `fit_axis`; residuals beyond ``limit`` get less weight.
     """
-    first, second = _across(axis)
+    first, second = _perpendicular_axes(axis)
     owner = np.arange(neurons.shape[1])
-    rows, extent = _place(neurons, owner, normals, axis, point, first, second)
+    rows, extent = _cylindrical_coordinates(neurons, owner, normals, axis, point, first, second)
     for i in range(owner.size):
         rows[4, i] *= weight[i]
     means = np.zeros((_REVOLUTION_SLICES, 6))  # weight, radius, derivatives
@@ -202,7 +202,7 @@ def _improve(
 def _derivatives(rows: F8, i: int, out: F8) -> None:
     """Write 1, the radius, and its derivatives with respect to two shifts and two tilts.
 
-    The point is column i of ``rows``, from `_place`; ``out`` is (6,).
+    The point is column i of ``rows``, from `_cylindrical_coordinates`; ``out`` is (6,).
     """
     out[0], out[1] = 1.0, rows[1, i]
     out[2], out[3] = -rows[2, i], -rows[3, i]
@@ -214,7 +214,7 @@ def _move(axis: F8, point: F8, first: F8, second: F8, move: F8, farthest: float)
     """Shift the axis by at most ``farthest``, and tilt it by at most 0.3 rad.
 
     ``move`` is two shifts and, if it has four elements, two tilts, along ``first`` and ``second``
-    from `_across`. ``axis`` and ``point`` (3,) are changed in place.
+    from `_perpendicular_axes`. ``axis`` and ``point`` (3,) are changed in place.
     """
     length = np.sqrt(move[0] ** 2 + move[1] ** 2)
     share = min(1.0, farthest / max(length, 1e-9))
@@ -237,13 +237,13 @@ def _measure(
 ) -> tuple[float, float, float]:
     """Write the profile of all points about an axis, one row of ``slices`` (k, 4) per slice.
 
-    The other parameters are as in `_place`. A row is the slice's fraction of all points, the mean
-    radius, the standard deviation from it, and the fraction of its points that face the axis.
-    Returns the root mean square of the deviations in all slices, the length along the axis, and the
-    mean radius.
+    The other parameters are as in `_cylindrical_coordinates`. A row is the slice's fraction of all
+    points, the mean radius, the standard deviation from it, and the fraction of its points that
+    face the axis. Returns the root mean square of the deviations in all slices, the length along
+    the axis, and the mean radius.
     """
-    first, second = _across(axis)
-    rows, extent = _place(cloud, owner, normals, axis, point, first, second)
+    first, second = _perpendicular_axes(axis)
+    rows, extent = _cylindrical_coordinates(cloud, owner, normals, axis, point, first, second)
     count = rows.shape[1]
     slices[:] = 0.0
     weights = np.zeros(_REVOLUTION_SLICES)
