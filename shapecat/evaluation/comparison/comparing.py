@@ -102,7 +102,7 @@ def compare(
         _require_same_recording(finished, other)
     tally, repeated = Tally(), repeated_stamps(folder)
     with ExitStack() as stack:
-        clouds, notes = _clouds(finished, recording, stack)
+        recorded_frames, notes = _recorded_frames(finished, recording, stack)
         notes += numbering_notes(other, finished.info["options"]["start_s"])
         total = int(finished.info["counts"]["frames"])
         for done, (key, row, found) in enumerate(run_labellings(finished), start=1):
@@ -112,7 +112,7 @@ def compare(
                 tally.only_run += 1
             else:
                 _compare_frame(
-                    tally, key, row, found, true, clouds, (done - 1) * _PICTURES // total
+                    tally, key, row, found, true, recorded_frames, (done - 1) * _PICTURES // total
                 )
             observe("compare", done, total)
     if not tally.frames:
@@ -175,7 +175,7 @@ def _categories_left_out(tally: Tally, categories: Sequence[str]) -> list[str]:
     return [f"The metrics of categories leave out {what}: the model has no such category."]
 
 
-def _clouds(
+def _recorded_frames(
     finished: FinishedRun, recording: Path | None, stack: ExitStack
 ) -> tuple[Iterator[Frame], list[str]]:
     """Return the frames of the recording, opened in ``stack``, and an empty list.
@@ -199,16 +199,16 @@ def _compare_frame(
     row: Mapping[str, Any],
     found: Labelling,
     true: Labelling,
-    clouds: Iterator[Frame],
+    recorded_frames: Iterator[Frame],
     part: int,
 ) -> None:
     """Match the objects of a frame, and count agreements and differences in ``tally``.
 
-    ``row`` is the frame's row in the table of the run; ``clouds`` yields the frames of the
+    ``row`` is the frame's row in the table of the run; ``recorded_frames`` yields the frames of the
     recording. Keep a picture of the frame if it differs more than all earlier frames in its part of
     the run, number ``part``.
     """
-    frame = next((f for f in clouds if (f.topic, f.index) == key), None)
+    frame = next((f for f in recorded_frames if (f.topic, f.index) == key), None)
     _require_same_size(found, true, frame, key)
     found = labelled_part(found, true)
     matched = match_objects(found.items, true.items)
