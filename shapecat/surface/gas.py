@@ -89,7 +89,7 @@ def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float)
     ``neurons``, ``signals`` and ``share`` (``component_share``) are as in `SurfaceSettings`.
     Returns the neurons (k, 3), metres, and the edges (e, 2).
     """
-    cloud, frame = _normalise(points)
+    cloud, shift_scale = _normalise(points)
     target = _target_size(cloud, neurons)
     gas = empty_gas(target)
     state = np.uint64(seed)
@@ -97,7 +97,7 @@ def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float)
     _link_two_points(cloud, gas, state)
     count = grow_fritzke(cloud, state, gas, target, signals, max(interval, 1), _RATES)
     adjacent = finish_graph(cloud, gas, int(count), share)  # int(): else numba compiles it twice
-    return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent)
+    return _in_metres(gas, adjacent.shape[0], shift_scale), edge_list(adjacent)
 
 
 @kernel
@@ -106,7 +106,7 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U
 
     The other parameters and the results are as in `_by_fritzke`.
     """
-    cloud, frame = _normalise(points)
+    cloud, shift_scale = _normalise(points)
     target = _target_size(cloud, neurons)
     # differs: a bound on the neurons, for memory; and thresholds relative to the object. If a
     # neuron's share of the surface is a square of side h, the mean squared distance of its points
@@ -123,7 +123,7 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U
         _RATES,
     )  # fmt: skip
     adjacent = finish_graph(cloud, gas, int(count), share)  # int(): else numba compiles it twice
-    return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent)
+    return _in_metres(gas, adjacent.shape[0], shift_scale), edge_list(adjacent)
 
 
 @kernel(inner=True)
@@ -134,32 +134,35 @@ def _normalise(points: F4) -> tuple[Cloud, F8]:
     """
     step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
     size = (points.shape[0] + step - 1) // step
-    frame = np.zeros(4)
+    shift_scale = np.zeros(4)
     for i in range(0, points.shape[0], step):
         for axis in range(3):
-            frame[axis] += points[i, axis] / size
+            shift_scale[axis] += points[i, axis] / size
     for i in range(points.shape[0]):
         for axis in range(3):
-            frame[3] = max(frame[3], abs(points[i, axis] - frame[axis]))
-    unit = frame[3] if frame[3] > 0 else 1.0
+            shift_scale[3] = max(shift_scale[3], abs(points[i, axis] - shift_scale[axis]))
+    unit = shift_scale[3] if shift_scale[3] > 0 else 1.0
     x = np.zeros(size, np.float32)
     y = np.zeros(size, np.float32)
     z = np.zeros(size, np.float32)
     for i in range(size):
-        x[i] = (points[i * step, 0] - frame[0]) / unit
-        y[i] = (points[i * step, 1] - frame[1]) / unit
-        z[i] = (points[i * step, 2] - frame[2]) / unit
-    return Cloud(x, y, z), frame
+        x[i] = (points[i * step, 0] - shift_scale[0]) / unit
+        y[i] = (points[i * step, 1] - shift_scale[1]) / unit
+        z[i] = (points[i * step, 2] - shift_scale[2]) / unit
+    return Cloud(x, y, z), shift_scale
 
 
 @kernel(inner=True)
-def _in_metres(gas: Gas, count: int, frame: F8) -> F4:
-    """Return the first ``count`` neurons, (count, 3) metres; ``frame`` is from `_normalise`."""
+def _in_metres(gas: Gas, count: int, shift_scale: F8) -> F4:
+    """Return the first ``count`` neurons, (count, 3) metres.
+
+    ``shift_scale`` (4,) is from `_normalise`.
+    """
     neurons = np.zeros((count, 3), np.float32)
     for i in range(count):
-        neurons[i, 0] = gas.x[i] * frame[3] + frame[0]
-        neurons[i, 1] = gas.y[i] * frame[3] + frame[1]
-        neurons[i, 2] = gas.z[i] * frame[3] + frame[2]
+        neurons[i, 0] = gas.x[i] * shift_scale[3] + shift_scale[0]
+        neurons[i, 1] = gas.y[i] * shift_scale[3] + shift_scale[1]
+        neurons[i, 2] = gas.z[i] * shift_scale[3] + shift_scale[2]
     return neurons
 
 
