@@ -23,7 +23,7 @@ from shapecat.recordings.pinhole import (
     is_rectified,
 )
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.registration import are_equal, are_similar, is_straight
+from shapecat.recordings.registration import are_equal, are_similar, is_nearly_undistorted
 from shapecat.recordings.sensors import is_of_realsense_recorder, same_frame
 from shapecat.recordings.stamps import Clock, stamp_ns
 from shapecat.recordings.streams import Stream
@@ -123,7 +123,7 @@ def _decided(waiting: Sequence[Frame], partners: Mapping[str, "_Partner"]) -> bo
     partner = partners.get(first.topic)
     return (
         partner is None
-        or partner.reaches(first)
+        or partner.has_read_image_of(first)
         or len(waiting) > _HELD_FRAMES
         or last.log_time_ns - first.log_time_ns > _PATIENCE_NS
     )
@@ -201,7 +201,7 @@ class _Partner:
             self._setbacks, self._newest = self._setbacks + 1, None
         self._latest = frame.stamp_ns
 
-    def reaches(self, frame: Frame) -> bool:
+    def has_read_image_of(self, frame: Frame) -> bool:
         """Return whether the image of a frame, if it has one, has been read.
 
         Once an image with the same or a later stamp has been read, no later image can be nearer.
@@ -270,8 +270,8 @@ class _Partner:
             raise MessageError(msg)
         named = not is_of_realsense_recorder(self.stream.topic)
         one_frame = named and same_frame(image.frame_id, frame.frame_id)
-        straight = lens is None or is_straight(lens, frame.camera)
-        alike = lens is None or (straight and are_similar(lens, frame.camera))
+        undistorted = lens is None or is_nearly_undistorted(lens, frame.camera)
+        alike = lens is None or (undistorted and are_similar(lens, frame.camera))
         if same_shape and one_frame and alike:
             return ColourView(image, lens or _lens(frame.camera))
         if lens is None:
@@ -285,7 +285,7 @@ class _Partner:
             return ColourView(image, lens, pose if offset is None else compose(pose, offset))
         # Only registered images have the intrinsics of the depth camera.
         if same_shape and are_equal(lens, frame.camera):
-            return ColourView(image, lens, None if straight else IDENTITY)
+            return ColourView(image, lens, None if undistorted else IDENTITY)
         names = (name or "a frame without a name" for name in (frame.frame_id, image.frame_id))
         msg = f"no transform between {' and '.join(names)}"
         raise MessageError(msg)

@@ -9,14 +9,14 @@ from collections.abc import Callable, Collection, Iterator
 from shapecat.recordings.messages import Message
 from shapecat.recordings.recording import Recording
 
-__all__ = ["AROUND_NS", "LookAhead", "is_read_at_once"]
+__all__ = ["AROUND_NS", "LookAhead", "reads_all_first"]
 
 AROUND_NS = 10_000_000_000
 """Messages are read this long before and after a frame. Drivers log a message at most seconds after
 its stamp, and publish transforms more often than this."""
 
 
-def is_read_at_once(recording: Recording) -> bool:
+def reads_all_first(recording: Recording) -> bool:
     """Return whether to read all messages at the start: the recording is short or has no index."""
     return recording.end_ns - recording.start_ns <= 2 * AROUND_NS or not recording.indexed
 
@@ -27,7 +27,7 @@ class LookAhead:
     Attributes
     ----------
     whole : whether all messages are passed on, regardless of the frames. This is so if
-        `is_read_at_once`, or after `read_all`.
+        `reads_all_first`, or after `read_all`.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class LookAhead:
         *,
         skips: bool = True,
     ) -> None:
-        """Pass on the first messages, or all if `is_read_at_once`.
+        """Pass on the first messages, or all if `reads_all_first`.
 
         Parameters
         ----------
@@ -52,7 +52,7 @@ class LookAhead:
         self._take, self._forget, self._skips = take, forget, skips
         self._stamp_ns: int | None = None
         self._forgotten_ns = self._reached_ns = 0
-        self.whole = is_read_at_once(recording)
+        self.whole = reads_all_first(recording)
         self._read_from(recording.start_ns)
 
     def read_all(self) -> None:

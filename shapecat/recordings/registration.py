@@ -11,13 +11,13 @@ from shapecat.cameras.colour import LensCamera
 from shapecat.cameras.lenses import distort
 from shapecat.types import Camera
 
-__all__ = ["are_equal", "are_similar", "is_straight"]
+__all__ = ["are_equal", "are_similar", "is_nearly_undistorted"]
 
 _NEAR = 0.01
 """Intrinsics that differ by less than this fraction of the image width are similar."""
 _EQUAL = 1e-6
 """Intrinsics that differ by less than this fraction of the image width are equal."""
-_STRAIGHT_PX = 2.0
+_UNDISTORTED_PX = 2.0
 """Images are treated as registered if the lens moves each pixel by less than this."""
 _STEPS = 9
 """Rows and columns of the grid of pixels at which lens distortion is computed."""
@@ -33,12 +33,12 @@ def are_equal(lens: LensCamera, camera: Camera | None) -> bool:
     return _are_within(lens, camera, _EQUAL)
 
 
-def is_straight(lens: LensCamera, camera: Camera | None) -> bool:
+def is_nearly_undistorted(lens: LensCamera, camera: Camera | None) -> bool:
     """Return whether a lens moves each pixel of a pinhole camera by less than 2 pixels.
 
     The result is True if the lens has no distortion, or if ``camera`` is None.
     """
-    return _bend_px(lens, camera) < _STRAIGHT_PX
+    return _bend_px(lens, camera) < _UNDISTORTED_PX
 
 
 def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> bool:

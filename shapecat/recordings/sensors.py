@@ -79,17 +79,17 @@ def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
     both namespaces, as on two robots of the same kind.
     """
     places = {stream.topic: _place(stream.topic) for stream in streams}
-    twins = {
+    instances = {
         (places[a.topic].space, places[b.topic].space)
         for a, b in permutations(streams, 2)
-        if _are_twins(a, b, places[a.topic], places[b.topic])
+        if _are_from_two_instances(a, b, places[a.topic], places[b.topic])
     }
 
     def are_same(a: Stream, b: Stream) -> bool:
         first, second = places[a.topic], places[b.topic]
         one_frame = a.frame_id != "" and same_frame(a.frame_id, b.frame_id)
         return _share_namespace(first, second) or (
-            one_frame and (first.space, second.space) not in twins
+            one_frame and (first.space, second.space) not in instances
         )
 
     groups: list[list[Stream]] = []
@@ -116,7 +116,7 @@ def _share_namespace(a: _Place, b: _Place) -> bool:
     return a.space != () or all("depth" in "/".join(one.rest[:-1]) for one in (a, b))
 
 
-def _are_twins(a: Stream, b: Stream, first: _Place, second: _Place) -> bool:
+def _are_from_two_instances(a: Stream, b: Stream, first: _Place, second: _Place) -> bool:
     """Return whether two streams seem to be from two instances of a driver, in two namespaces.
 
     Their topics are then the same after the namespace, but have different calibrations. Clouds have

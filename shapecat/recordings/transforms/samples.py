@@ -27,7 +27,7 @@ near the ends of a gap."""
 _NEVER_NS = 2**63
 _GAP_NS = 500_000_000
 """Shorter intervals between two samples are not gaps: slow localization publishes as rarely."""
-_UNUSUAL = 3
+_GAP_RATIO = 3
 """A gap is longer than this many times the mean of the other intervals, so that transforms at a low
 rate have no gaps."""
 _LONGEST_NS = 10_000_000_000
@@ -104,7 +104,7 @@ class TransformTrack:
         if gap <= _GAP_NS or min(stamp - begin, end - stamp) <= TOLERANCE_NS:
             return 0
         others = self._intervals - 1, self._span_ns - min(gap, _LONGEST_NS)
-        usual = gap * others[0] <= _UNUSUAL * others[1]
+        usual = gap * others[0] <= _GAP_RATIO * others[1]
         return 0 if usual or are_close(self[at - 1], self[at]) else gap
 
     def add(self, stamp: int, sample: TransformSample) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from copy import deepcopy
 
-from shapecat.recordings.look_ahead import AROUND_NS, LookAhead, is_read_at_once
+from shapecat.recordings.look_ahead import AROUND_NS, LookAhead, reads_all_first
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.transforms.buffer import TransformBuffer
 from shapecat.recordings.transforms.delays import Delays
@@ -44,9 +44,9 @@ class TransformWindow:
         ``sensor_topics`` selects the robot if there are several, see `transform_topics`.
         """
         topics = transform_topics(recording, sensor_topics).moving
-        at_once = is_read_at_once(recording)
-        buffer = read_transforms(recording, static_only=not at_once, sensor_topics=sensor_topics)
-        if at_once or not topics:
+        reads_all = reads_all_first(recording)
+        buffer = read_transforms(recording, static_only=not reads_all, sensor_topics=sensor_topics)
+        if reads_all or not topics:
             return cls(buffer)
         reader = TransformReader(recording, buffer)
         kinds = {topic.type for topic in recording.topics if topic.name in topics}
