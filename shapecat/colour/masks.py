@@ -161,7 +161,7 @@ def union(masks: Sequence[Mask]) -> Mask:
 
 
 @kernel(inner=True)
-def _step(label: int, packed: int) -> int:
+def _update_last_object(label: int, packed: int) -> int:
     """Return ``packed`` updated with the label of the next pixel.
 
     ``packed`` describes the last object encountered: its label in the upper 16 bits, and below them
@@ -171,10 +171,13 @@ def _step(label: int, packed: int) -> int:
 
 
 @kernel(inner=True)
-def _step_row(labels: I4, packed: I4, result: I4) -> None:
-    """Apply `_step` to all pixels of a row (w,); ``packed`` and ``result`` are the states (w,)."""
+def _update_row(labels: I4, packed: I4, result: I4) -> None:
+    """Apply `_update_last_object` to all pixels of a row, ``labels`` (w,).
+
+    ``packed`` (w,) are the states before, ``result`` (w,) those after.
+    """
     for u in range(labels.size):
-        result[u] = _step(labels[u], packed[u])
+        result[u] = _update_last_object(labels[u], packed[u])
 
 
 @kernel
@@ -187,20 +190,20 @@ def _fill(labels: I4, region: tuple[int, int, int, int], narrow: int, wide: int)
     """
     left, top, right, bottom = region
     height, width = bottom - top, right - left
-    west = np.zeros((height, width + 1), np.int32)  # `_step` from the left
-    north = np.zeros((height + 1, width), np.int32)  # `_step` from above
+    west = np.zeros((height, width + 1), np.int32)  # states from the left
+    north = np.zeros((height + 1, width), np.int32)  # states from above
     for v in range(height):
         row = labels[top + v, left:right]
-        _step_row(row, north[v], north[v + 1])
+        _update_row(row, north[v], north[v + 1])
         for u in range(width):
-            west[v, u + 1] = _step(row[u], west[v, u])
+            west[v, u + 1] = _update_last_object(row[u], west[v, u])
     east, south = np.zeros(width + 1, np.int32), np.zeros((2, width), np.int32)
     for v in range(height - 1, -1, -1):
         row, below = labels[top + v, left:right], south[v % 2]
-        _step_row(row, south[(v + 1) % 2], below)
+        _update_row(row, south[(v + 1) % 2], below)
         for u in range(width - 1, -1, -1):
             label = row[u]
-            east[u] = _step(label, east[u + 1])
+            east[u] = _update_last_object(label, east[u + 1])
             if label < 0 or (label == 0 and west[v, u + 1] >> 16 == east[u] >> 16):
                 w, n = west[v, u + 1], north[v + 1, u]
                 surrounding = _surrounding(label, w, east[u], n, below[u], narrow, wide)
@@ -212,10 +215,10 @@ def _fill(labels: I4, region: tuple[int, int, int, int], narrow: int, wide: int)
 def _surrounding(label: int, w: int, e: int, n: int, s: int, narrow: int, wide: int) -> int:
     """Return the object that surrounds a pixel of label 0 or -1; the label itself if none does.
 
-    ``w``, ``e``, ``n`` and ``s`` are from `_step`, for the four directions. An object surrounds a
-    pixel of label 0 if the gap at the pixel is at most ``narrow`` pixels along both axes. For label
-    -1, one axis is enough, or the object on three sides within ``wide`` pixels, with no label 0 in
-    between.
+    ``w``, ``e``, ``n`` and ``s`` are from `_update_last_object`, for the four directions. An object
+    surrounds a pixel of label 0 if the gap at the pixel is at most ``narrow`` pixels along both
+    axes. For label -1, one axis is enough, or the object on three sides within ``wide`` pixels,
+    with no label 0 in between.
     """
     across = w >> 16 if w >> 16 == e >> 16 and _gap(w) + _gap(e) <= narrow + 1 else 0
     along = n >> 16 if n >> 16 == s >> 16 and _gap(n) + _gap(s) <= narrow + 1 else 0
@@ -232,7 +235,7 @@ def _surrounding(label: int, w: int, e: int, n: int, s: int, narrow: int, wide: 
 
 @kernel(inner=True)
 def _gap(packed: int) -> int:
-    """Return the distance in a state of `_step`, pixels."""
+    """Return the distance in a state of `_update_last_object`, pixels."""
     return (packed & 0xFFFF) >> 2
 
 

@@ -101,9 +101,9 @@ def _splat(
     is from `_rays`. ``scale`` is the width of a depth pixel in colour pixels at equal distance.
     ``size`` is width and height of the colour image.
     """
-    beside = _list_beside(depth, pixels)
+    background = _sample_background(depth, pixels)
     projections = _project_pixels(depth, pixels, rays, lens)
-    around = _project_pixels(depth, beside, rays, lens)
+    around = _project_pixels(depth, background, rays, lens)
     squares = _cover(projections, labels, np.float32(scale / 2), size, boxes)
     left, top, right, bottom = _window(boxes, int(_BESIDE_PX * scale), size)
     splat = np.full((bottom - top, right - left), np.int32(-1))
@@ -121,7 +121,7 @@ def _splat(
 
 
 @kernel(inner=True)
-def _list_beside(depth: F4, pixels: U4) -> U4:
+def _sample_background(depth: F4, pixels: U4) -> U4:
     """Return, in every `_SPARSE`-th row and column, the pixels with depth that are not listed.
 
     ``pixels`` lists flat indices into ``depth``, and so does the result.
@@ -133,13 +133,13 @@ def _list_beside(depth: F4, pixels: U4) -> U4:
         v, u = _row_and_column(pixel, v, width)
         if (v | u) % _SPARSE == 0:  # a power of 2, so that this tests both
             outside[v // _SPARSE, u // _SPARSE] = False
-    pixels_beside, count = np.zeros(outside.size, np.uint32), 0
+    background, count = np.zeros(outside.size, np.uint32), 0
     for j in range(rows):
         for i in range(columns):
             if outside[j, i] and depth[j * _SPARSE, i * _SPARSE] > 0:
-                pixels_beside[count] = (j * width + i) * _SPARSE
+                background[count] = (j * width + i) * _SPARSE
                 count += 1
-    return pixels_beside[:count]
+    return background[:count]
 
 
 @kernel(inner=True)
