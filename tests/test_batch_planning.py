@@ -24,7 +24,7 @@ from shapecat.batch.finding_urls import _combined_key
 from shapecat.batch.ledger import Ledger, Outcome
 from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State, open_manifest
 from shapecat.batch.naming import existing_names, name_folders
-from shapecat.batch.plans import _input_key, parse_shard, part_of, plan_batch
+from shapecat.batch.plans import _input_key, parse_shard, plan_batch, shard_of
 from shapecat.batch.runs import _reporter, process_here, process_on
 from shapecat.batch.sources import Source
 from shapecat.batch.storage import Location, content_key
@@ -1207,7 +1207,7 @@ def test_batch_exit_code_combines_outcomes(codes: tuple[int, ...], expected: int
 def test_shards_are_disjoint_in_any_order_of_recordings() -> None:
     """Machines may list a folder in different orders."""
     named = [(name, Source(f"{name}.mcap", "", name, "")) for name in "dbeac"]
-    first, second = part_of(named, 0, 2), part_of(named[::-1], 1, 2)
+    first, second = shard_of(named, 0, 2), shard_of(named[::-1], 1, 2)
 
     assert [name for name, _ in first] == ["a", "c", "e"]
     assert [name for name, _ in second] == ["b", "d"]

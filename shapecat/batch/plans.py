@@ -27,7 +27,7 @@ from shapecat.runs.jobs import Job, differences
 from shapecat.runs.run_info import RunInfo, parse_run
 from shapecat.system.files import partial_path
 
-__all__ = ["Batch", "Status", "Task", "parse_shard", "part_of", "plan_batch", "run_of"]
+__all__ = ["Batch", "Status", "Task", "parse_shard", "plan_batch", "run_of", "shard_of"]
 
 _NamedSource = tuple[str, Source]
 
@@ -122,7 +122,7 @@ def parse_shard(text: str) -> tuple[int, int]:
     return index % count, count
 
 
-def part_of(named: Sequence[_NamedSource], index: int, count: int) -> list[_NamedSource]:
+def shard_of(named: Sequence[_NamedSource], index: int, count: int) -> list[_NamedSource]:
     """Return a shard of the recordings; the shards are disjoint, and together cover the list."""
     return sorted(named, key=lambda pair: pair[0])[index::count]
 
@@ -172,7 +172,7 @@ def plan_batch(
         names = name_folders(stems, parents, existing_names(found.sources, out, listing, noted))
         named = list(zip(names, found.sources, strict=True))
         planner = _Planner(job, out, listing, manifest)
-        chosen = part_of(named, *part) if part is not None else named
+        chosen = shard_of(named, *part) if part is not None else named
         yield Batch(planner.tasks(chosen), manifest, found.skipped, found.notes)
 
 
