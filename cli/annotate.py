@@ -8,7 +8,7 @@ import click
 from shapecat.outputs.counts import plural
 
 from .options import ANY_PATH, boxes_option
-from .render import changed_labels, missed_words, progress_bars
+from .render import changed_labels, describe_missed, progress_bars
 
 
 @click.command()
@@ -99,4 +99,4 @@ def _show(transfer: dict[str, Any], labels: Path | None) -> None:
         text = "this table is not in a run folder, so shapecat assumes the same fixed frame and"
         click.echo(f"{labels}: {text} unmoved objects; give the run folder to check both", err=True)
     for item in missed:
-        click.echo(missed_words(item), err=True)
+        click.echo(describe_missed(item), err=True)

@@ -10,7 +10,7 @@ import click
 
 from shapecat.outputs.counts import count_words, plural
 
-from .render import missed_words, print_table
+from .render import describe_missed, print_table
 
 if TYPE_CHECKING:
     from shapecat.batch.ledger import Outcome
@@ -95,7 +95,7 @@ def _print_corrections(job: "Job", summary: "Summary") -> None:
     rest = f"; the others are in {job.place}/tracks.previous.csv" if missed else ""
     counts = f"{len(done)} of {len(done) + len(missed)}"
     text = f"{_short_name(job)}: transferred {counts} corrected labels{rest}"
-    click.echo("\n".join((text, *map(missed_words, missed))), err=True)
+    click.echo("\n".join((text, *map(describe_missed, missed))), err=True)
 
 
 def _row(job: "Job", summary: "Summary") -> tuple[Any, ...]:

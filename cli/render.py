@@ -134,7 +134,7 @@ def note_skipped(learned: Mapping[str, Any]) -> None:
         click.echo(f"Warning: {names}: no usable views (.pcd, .ply or .npz)", err=True)
 
 
-def missed_words(missed: Mapping[str, Any]) -> str:
+def describe_missed(missed: Mapping[str, Any]) -> str:
     """Describe a label that was not transferred, with the reason, from a `Missed` as a dict."""
     what = f"track #{missed['old_track']}, {missed['label']}: " if missed["old_track"] else ""
     return f"  {what}{missed['reason']}"
