@@ -122,16 +122,19 @@ def database(path: Path, *, definitions: bool) -> Path:
 
 
 def splits(path: Path) -> Path:
-    """Write two parts without metadata, the second one compressed."""
-    (path / "a").mkdir()
-    for name, begin in (("a_0.mcap", 0), ("a_1.mcap", FRAMES * PERIOD)):
-        part = mcap(path)
-        data = part.read_bytes()
-        part.unlink()
-        if begin:
-            data = zstandard.compress(data)
-        (path / "a" / (name + ".zstd" * bool(begin))).write_bytes(data)
-    return path / "a"
+    """Write two parts without metadata; the second continues the first, and is compressed."""
+    first, second = path / "a" / "a_0.mcap", path / "a" / "a_1.mcap"
+    first.parent.mkdir()
+    items = list(serialized(stream(FACTORY, 2 * FRAMES), FACTORY))
+    split = next(k for k, (_, _, time, _) in enumerate(items) if time == EPOCH + FRAMES * PERIOD)
+    for part, messages in ((first, items[:split]), (second, items[split:])):
+        with mcap_writer(part, chunk_size=60_000) as writer:
+            channels = McapChannels(writer, FACTORY.typestore)
+            for item in messages:
+                channels.write(*item)
+    second.with_name("a_1.mcap.zstd").write_bytes(zstandard.compress(second.read_bytes()))
+    second.unlink()
+    return first.parent
 
 
 def ros1_mcap(path: Path) -> Path:
