@@ -120,14 +120,14 @@ class Browser:
         self._ask("POST", "/actions", {"actions": [source]})
 
     def tab(self) -> str:
-        """Open another tab, and return its handle; `turn_to` chooses the tab to drive."""
+        """Open another tab, and return its handle; `switch_to` chooses the tab to drive."""
         return str(self._ask("POST", "/window/new", {"type": "tab"})["handle"])
 
     def tabs(self) -> list[str]:
         """Return the handles of the open tabs."""
         return [str(handle) for handle in self._ask("GET", "/window/handles")]
 
-    def turn_to(self, tab: str) -> None:
+    def switch_to(self, tab: str) -> None:
         """Drive another tab from now on."""
         self._ask("POST", "/window", {"handle": tab})
 
@@ -135,17 +135,17 @@ class Browser:
         """Close the current tab."""
         self._ask("DELETE", "/window")
 
-    def renew(self) -> None:
+    def reset(self) -> None:
         """Close all tabs but one, and discard its page, stored corrections and console messages."""
         first, *others = self.tabs()
         for tab in others:
-            self.turn_to(tab)
+            self.switch_to(tab)
             self.close_tab()
-        self.turn_to(first)
+        self.switch_to(first)
         self.open("about:blank")
         stored = {"origin": "file://", "storageTypes": "local_storage"}
         self.cdp("Storage.clearDataForOrigin", stored)
-        self.complaints()
+        self.console_messages()
 
     def wait(self, script: str) -> None:
         """Wait until a script returns true."""
@@ -160,7 +160,7 @@ class Browser:
         """Send a command of the DevTools protocol."""
         return self._ask("POST", "/goog/cdp/execute", {"cmd": command, "params": parameters})
 
-    def complaints(self) -> list[str]:
+    def console_messages(self) -> list[str]:
         """Return the messages that the console has received since the last call."""
         return [entry["message"] for entry in self._ask("POST", "/se/log", {"type": "browser"})]
 

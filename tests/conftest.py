@@ -321,5 +321,5 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.fixture
 def browser(chromium: Browser) -> Browser:
     """Open an empty tab, without the tabs and console messages of other tests."""
-    chromium.renew()
+    chromium.reset()
     return chromium

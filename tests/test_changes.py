@@ -33,7 +33,7 @@ from tests.test_tables import CATEGORIES, detection, perception
 
 STILL = (0.0, 0.0, 0.0, 1.0)
 ZOOMED = replace(CAMERA, fx=75.0, fy=76.0)
-BODIES = ("/cam/depth/image_raw", "/cam/depth/other_raw")
+TOPICS = ("/cam/depth/image_raw", "/cam/depth/other_raw")
 """Two streams of one depth camera, which share its calibration."""
 
 
@@ -96,7 +96,7 @@ def test_colour_period_follows_latest_images(tmp_path: Path) -> None:
 
 def read_both(path: Path, wanted: str | None = None) -> Pairs:
     with open_recording(path) as recording:
-        streams = choose_streams(recording, BODIES)
+        streams = choose_streams(recording, TOPICS)
         colours = pair_colours(recording, streams, wanted)
         return list(frames_with_colour(recording, streams, colours, skipped=Counter()))
 
@@ -109,11 +109,11 @@ def test_new_calibration_applies_to_both_streams_of_camera(tmp_path: Path) -> No
         items.append(("/cam/depth/camera_info", stamp, info(stamp, depth)))
         items.append(("/cam/color/camera_info", stamp, info(stamp, colour)))
         items.append(("/cam/color/image_raw", stamp, raw(stamp, gradient(60, 80), "rgb8", "color")))
-        items += [(topic, stamp, image(stamp, wavy_depth())) for topic in BODIES]
+        items += [(topic, stamp, image(stamp, wavy_depth())) for topic in TOPICS]
     pairs = read_both(write(tmp_path / "a.mcap", in_order(items)), "/cam/color/image_raw")
 
     lenses = [view.lens.pinhole.fx for _, view in pairs if view and view.lens]
-    assert sorted(frame.topic for frame, _ in pairs) == sorted([*BODIES, *BODIES])
+    assert sorted(frame.topic for frame, _ in pairs) == sorted([*TOPICS, *TOPICS])
     assert [f.camera and f.camera.fx for f, _ in pairs] == [CAMERA.fx] * 2 + [ZOOMED.fx] * 2
     assert lenses == [WIDE.fx] * 2 + [90.0] * 2
 
@@ -233,9 +233,9 @@ def test_views_of_both_sensors_count() -> None:
             topic=topic,
         )
         for k in range(2)
-        for topic in BODIES
+        for topic in TOPICS
     ]
-    (hits,) = gather(found, together=BODIES)
+    (hits,) = gather(found, together=TOPICS)
 
     assert (hits.weights(np.arange(4)) > 0).all()
     first = np.flatnonzero(hits.topics[hits.rows] == 0)  # a track that one sensor saw

@@ -25,20 +25,20 @@ MS = SECOND // 1000
 
 
 def write_tables(
-    folder: Path, speed_m_s: float, offset_s: float, poses: str, carried_m_s: float = 0
+    folder: Path, speed_m_s: float, offset_s: float, poses: str, object_speed_m_s: float = 0
 ) -> None:
     """Write the tables of a camera that drives past objects, with late colour images.
 
     Parameters
     ----------
     poses : those in the tables: ``right``, ``none``, or ``still``, as in a frame of the robot.
-    carried_m_s : speed of the objects.
+    object_speed_m_s : speed of the objects.
     """
     objects = np.array([[0.1, 0.3, 1.9], [0.8, -0.4, 1.2], [1.4, 0.1, 1.5]])
     rows = range(20)
     stamps = [EPOCH + k * SECOND // 10 for k in rows]
     late = [stamp + round(offset_s * SECOND) for stamp in stamps]
-    fixed = [p + np.array([0.1 * k * carried_m_s, 0, 0]) for k in rows for p in objects]
+    fixed = [p + np.array([0.1 * k * object_speed_m_s, 0, 0]) for k in rows for p in objects]
     own = [np.array([0.1 * k * speed_m_s, 0, 0]) for k in rows for _ in objects]
     centers = [(p - q).tolist() for p, q in zip(fixed, own, strict=True)]
     placed: dict[str, list[Any]] = {
@@ -75,7 +75,7 @@ FAR = (
 
 
 @pytest.mark.parametrize(
-    ("speed_m_s", "carried_m_s", "offset_s", "poses", "wanted"),
+    ("speed_m_s", "object_speed_m_s", "offset_s", "poses", "wanted"),
     [
         (0.3, 0, 0.2, "none", DISPLACED.format("0.20", "0.06")),
         (0.3, 0, -0.2, "none", DISPLACED.format("0.20", "0.06")),
@@ -91,13 +91,13 @@ FAR = (
 def test_displaced_masks_are_reported(
     tmp_path: Path,
     speed_m_s: float,
-    carried_m_s: float,
+    object_speed_m_s: float,
     offset_s: float,
     poses: str,
     wanted: str | None,
 ) -> None:
     """Nothing else tells why a data set has masks beside its objects."""
-    write_tables(tmp_path, speed_m_s, offset_s, poses, carried_m_s)
+    write_tables(tmp_path, speed_m_s, offset_s, poses, object_speed_m_s)
 
     assert list(explain_colour_offsets(tmp_path)) == ([] if wanted is None else [wanted])
 

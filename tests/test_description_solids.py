@@ -13,7 +13,7 @@ from shapecat.description.revolution import fit_axis
 from shapecat.description.solids import SOLID_NAMES, solids
 
 EYE = np.array([8.0, 0.0, 6.0], np.float32)
-BOX = {name: k for k, name in enumerate(SOLID_NAMES)}
+INDEX = {name: k for k, name in enumerate(SOLID_NAMES)}
 
 
 def rows_of(points: F8) -> F4:
@@ -105,9 +105,9 @@ def test_box_fits_a_box_and_can_does_not(yaw: float) -> None:
     side, directions = half_cone(rng, slope=0.0)
     can = solid_features(rows_of(side), rows_of(directions))
 
-    assert box[BOX["box_faces"]] < 0.03
-    assert box[BOX["corner_upright"]] < 0.08 < can[BOX["corner_upright"]]
-    assert 2 * box[BOX["box_sides"]] < can[BOX["box_sides"]]
+    assert box[INDEX["box_faces"]] < 0.03
+    assert box[INDEX["corner_upright"]] < 0.08 < can[INDEX["corner_upright"]]
+    assert 2 * box[INDEX["box_sides"]] < can[INDEX["box_sides"]]
 
 
 def test_ball_has_small_residual_unlike_box() -> None:
@@ -118,9 +118,9 @@ def test_ball_has_small_residual_unlike_box() -> None:
     ball = solid_features(rows_of(normals + np.array([0.0, 0.0, 1.0])), rows_of(normals))
     cloud, directions = visible_box(rng, 0.0)
 
-    assert ball[BOX["ball_residual"]] < 0.01
-    assert ball[BOX["ball_height"]] == pytest.approx(1.0 / np.ptp(normals[:, 2]), abs=0.2)
-    assert solid_features(cloud, directions)[BOX["ball_residual"]] > 0.05
+    assert ball[INDEX["ball_residual"]] < 0.01
+    assert ball[INDEX["ball_height"]] == pytest.approx(1.0 / np.ptp(normals[:, 2]), abs=0.2)
+    assert solid_features(cloud, directions)[INDEX["ball_residual"]] > 0.05
 
 
 def outline_of(cloud: F8, eye: F4 = EYE) -> F4:

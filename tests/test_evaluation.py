@@ -119,7 +119,7 @@ def test_balanced_accuracy_ignores_categories_without_views() -> None:
 # --- data sets ---------------------------------------------------------------------------------
 
 
-def half_of(shape: str, size: float, rng: np.random.Generator) -> F4:
+def visible_points(shape: str, size: float, rng: np.random.Generator) -> F4:
     """Return noisy points (n, 3) of a shape that stands at z = 0, seen from +x, +y and above.
 
     ``size`` is its radius or half its width; both in metres.
@@ -147,7 +147,7 @@ def write_dataset(
             folder.mkdir(parents=True)
             size = rng.uniform(0.03, 0.06)
             for view in range(2):
-                points = half_of("post" if name == "unknown" else name, size, rng)
+                points = visible_points("post" if name == "unknown" else name, size, rng)
                 np.savez(folder / f"{view}.npz", points=points, viewpoint=[0.7, 0.7, 0.8])
     return root
 

@@ -167,12 +167,12 @@ def test_terminate_kills_running_tasks(tmp_path: Path) -> None:
         one.submit(abs, -1)
 
 
-def _refuse_threads(monkeypatch: pytest.MonkeyPatch, target: str, *, after: int = 0) -> None:
-    """Let only ``after`` threads run the method ``target``, as a limit of processes would."""
+def _refuse_threads(monkeypatch: pytest.MonkeyPatch, target: str, *, allowed: int = 0) -> None:
+    """Let only ``allowed`` threads run the method ``target``, as a limit of processes would."""
     start, started = threading.Thread.start, count()
 
     def limited(thread: threading.Thread) -> None:
-        if target in repr(getattr(thread, "_target", "")) and next(started) >= after:
+        if target in repr(getattr(thread, "_target", "")) and next(started) >= allowed:
             msg = "can't start new thread"
             raise RuntimeError(msg)
         start(thread)
@@ -195,7 +195,7 @@ def test_worker_without_listener_does_not_survive(monkeypatch: pytest.MonkeyPatc
 
 def test_fewer_threads_than_workers_do_all_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     """At the limit of processes, a batch would end with a traceback."""
-    _refuse_threads(monkeypatch, "LocalExecutor._dispatch", after=1)
+    _refuse_threads(monkeypatch, "LocalExecutor._dispatch", allowed=1)
 
     with LocalExecutor(2) as executor:
         assert list(executor.map(abs, [-1, -2])) == [1, 2]

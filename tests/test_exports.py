@@ -51,10 +51,10 @@ def relabel(folder: Path, labels: dict[int, str]) -> None:
     adopt_labels(corrected, folder)
 
 
-def boxes(folder: Path, which: str = "_full") -> dict[int, list[tuple[int, np.ndarray]]]:
+def boxes(folder: Path, suffix: str = "_full") -> dict[int, list[tuple[int, np.ndarray]]]:
     """Return for each frame the track and the corners (8, 3) of each box, read from the tables.
 
-    Full boxes are those of tracks; visible boxes (``which`` is empty) are those of detections.
+    Full boxes are those of tracks; visible boxes (``suffix`` is empty) are those of detections.
     """
     owner = {
         (row["frame"], row["detection"]): row
@@ -68,10 +68,10 @@ def boxes(folder: Path, which: str = "_full") -> dict[int, list[tuple[int, np.nd
         track = track_row["track"]
         if track in kept:
             box = {**row, **track_row}
-            half = np.array(box[f"size{which}"]) / 2
+            half = np.array(box[f"size{suffix}"]) / 2
             unit = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-            corners = (unit * half) @ rotation_from_quaternion(box[f"orientation{which}"]).T
-            found.setdefault(row["frame"], []).append((track, corners + box[f"center{which}"]))
+            corners = (unit * half) @ rotation_from_quaternion(box[f"orientation{suffix}"]).T
+            found.setdefault(row["frame"], []).append((track, corners + box[f"center{suffix}"]))
     return found
 
 
@@ -211,16 +211,16 @@ def test_exporting_again_removes_views_with_earlier_labels(run: Path, tmp_path: 
     assert (own / "view.pcd").exists()
 
 
-@pytest.mark.parametrize("which", ["", "_full"])
-def test_kitti_boxes_match_tables_within_1_mm(run: Path, tmp_path: Path, which: str) -> None:
+@pytest.mark.parametrize("suffix", ["", "_full"])
+def test_kitti_boxes_match_tables_within_1_mm(run: Path, tmp_path: Path, suffix: str) -> None:
     """Detectors are trained on whole objects; visible boxes are optional."""
-    export_run(read_finished(run), "kitti", tmp_path, visible_boxes=not which)
+    export_run(read_finished(run), "kitti", tmp_path, visible_boxes=not suffix)
     out = tmp_path / "table"
     camera = intrinsics(run)
     worst, kinds = 0.0, set()
     with (out / "frames.csv").open() as file:
         index = list(csv.DictReader(file))
-    table_boxes = boxes(run, which)
+    table_boxes = boxes(run, suffix)
     for entry in index:
         projection = read_calibration(out, entry["number"])["P2"]
         sensor_from_rectified = np.linalg.inv(camera) @ projection[:, :3]

@@ -98,11 +98,11 @@ def test_coco_has_original_images_and_masks_of_tracks(run: Path, tmp_path: Path)
         box = [u.min(), v.min(), np.ptp(u) + 1, np.ptp(v) + 1]
         assert row["bbox"] == box
         assert row["area"] == mask.sum()
-        assert nearest(box, wanted[frames[row["image_id"]]].boxes.values()) <= BAND_PX
+        assert side_difference(box, wanted[frames[row["image_id"]]].boxes.values()) <= BAND_PX
         assert row["iscrowd"] == 0
 
 
-def nearest(box: list[int], others: Iterable[tuple[int, int, int, int]]) -> int:
+def side_difference(box: list[int], others: Iterable[tuple[int, int, int, int]]) -> int:
     """Return how far the sides of a box (x, y, w, h) are from those of the most similar, in px."""
     sides = np.add(box, [0, 0, *box[:2]])
     return min(int(np.abs(np.add(o, [0, 0, *o[:2]]) - sides).max()) for o in others)
@@ -121,7 +121,7 @@ def test_exported_masks_follow_colour_edges(coloured_run: Path, tmp_path: Path) 
         true_mask = np.bincount(true[frame][mask])[20:].argmax() + 20 == true[frame]
         depth = depth_masks[frame]
         pairs = [
-            (nearest(row["bbox"], [box]), mask_of(depth, [n]).full(*mask.shape))
+            (side_difference(row["bbox"], [box]), mask_of(depth, [n]).full(*mask.shape))
             for n, box in depth.boxes.items()
         ]
         before = min(pairs, key=lambda pair: pair[0])[1]
@@ -187,11 +187,11 @@ def test_yolo_polygons_cover_masks(run: Path, tmp_path: Path) -> None:
             corners = np.array(list(map(float, shares))).reshape(-1, 2)
             assert corners.min() >= 0
             assert corners.max() <= 1
-            mask, drawn = decoded(row["segmentation"]), drawing(corners * (960, 720), 720, 960)
+            mask, drawn = decoded(row["segmentation"]), filled(corners * (960, 720), 720, 960)
             assert (mask & drawn).sum() / (mask | drawn).sum() > 0.93
 
 
-def drawing(corners: Any, height: int, width: int) -> Any:
+def filled(corners: Any, height: int, width: int) -> Any:
     """Return the pixels (height, width) that are more than half inside a polygon (n, 2)."""
     image = Image.new("L", (4 * width, 4 * height))
     ImageDraw.Draw(image).polygon([tuple(4 * corner) for corner in corners], fill=16)
@@ -207,7 +207,7 @@ def test_outlines_enclose_all_pixels() -> None:
         image = np.zeros((70, 60), bool)
         for part in outlines(Mask(60, 100, coarse)):
             assert part.min(axis=0).tolist() >= [60, 100]
-            image |= drawing(part / 2, 70, 60)
+            image |= filled(part / 2, 70, 60)
         inside = image[50 : 50 + pixels.shape[0], 30 : 30 + pixels.shape[1]]
         assert (inside | ~pixels).all()  # holes are filled, no pixel is lost
         assert not np.delete(image, np.s_[50:66], axis=0).any()
@@ -218,7 +218,7 @@ def test_parts_of_object_are_joined_into_one_polygon() -> None:
     pixels[2:9, 3:14], pixels[10:18, 22:38] = True, True
     parts = outlines(Mask(0, 0, pixels))
     assert len(parts) == 2
-    drawn = drawing(joined(parts), 20, 40)
+    drawn = filled(joined(parts), 20, 40)
     assert (drawn & pixels).sum() / (drawn | pixels).sum() > 0.95
 
 

@@ -54,14 +54,14 @@ PIXELS = [(40, 70), (41, 70), (63, 92), (52, 81)]
 """Column and row of each pixel of the object."""
 
 
-def labelled(*, cut: bool, hidden: bool) -> LabelledFrame:
+def labelled(*, truncated: bool, occluded: bool) -> LabelledFrame:
     rotation = LEVEL_FROM_SENSOR.inv()
     axes = rotation.apply(AXES).T
     box = Box(rotation.apply(CENTER), SIZE, Rotation.from_matrix(axes).as_quat())
     indices = np.array(sorted(v * CAMERA.width + u for u, v in PIXELS), np.uint32)
     item = LabelledObject(
         4, "bowl", 0.9, box, indices, NeuralGas(np.zeros((0, 3)), np.zeros((0, 2), int)),
-        np.array([1.0]), np.array([1.0]), touches_border=cut, occluded=hidden,
+        np.array([1.0]), np.array([1.0]), touches_border=truncated, occluded=occluded,
     )  # fmt: skip
     return LabelledFrame("/depth", 0, 5, 6, "optical", None, (), (item,), (), {}, UP)
 
@@ -73,8 +73,8 @@ def frame() -> Frame:
     return Frame("/depth", 0, 5, 6, "optical", depth, CAMERA)
 
 
-def kitti(folder: Path, *, cut: bool, hidden: bool) -> KittiLabel:
-    views: Any = [(labelled(cut=cut, hidden=hidden), frame(), None)]
+def kitti(folder: Path, *, truncated: bool, occluded: bool) -> KittiLabel:
+    views: Any = [(labelled(truncated=truncated, occluded=occluded), frame(), None)]
     finished: Any = SimpleNamespace(categories=())
     assert write_kitti(folder, views, finished) == 1
     (label,) = read_labels(folder)
@@ -83,7 +83,7 @@ def kitti(folder: Path, *, cut: bool, hidden: bool) -> KittiLabel:
 
 def test_kitti_line_matches_hand_calculation(tmp_path: Path) -> None:
     """The position is the bottom of the box; alpha is the yaw minus the bearing."""
-    label = kitti(tmp_path, cut=True, hidden=False)
+    label = kitti(tmp_path, truncated=True, occluded=False)
 
     assert (label.kind, label.truncated, label.occluded) == ("bowl", 1.0, 0)
     assert_allclose(label.size, [0.23, 0.14, 0.31], atol=1e-5)
@@ -95,11 +95,11 @@ def test_kitti_line_matches_hand_calculation(tmp_path: Path) -> None:
 
 def test_kitti_distinguishes_truncated_from_occluded(tmp_path: Path) -> None:
     """A truncated object is cut by the image border; an occluded one is hidden by another."""
-    assert kitti(tmp_path, cut=False, hidden=True)[1:3] == (0.0, 1)
+    assert kitti(tmp_path, truncated=False, occluded=True)[1:3] == (0.0, 1)
 
 
 def test_kitti_calibration_projects_points_to_pixels(tmp_path: Path) -> None:
-    kitti(tmp_path, cut=False, hidden=False)
+    kitti(tmp_path, truncated=False, occluded=False)
     matrices, points = read_calibration(tmp_path), read_points(tmp_path)
     for name in ("P0", "P1", "P3"):
         assert np.array_equal(matrices[name], matrices["P2"])
@@ -122,7 +122,7 @@ def test_kitti_frame_of_depth_image_looks_along_its_camera(
         "z", roll, degrees=True
     )
     up = level_from_sensor.inv().apply([0, -1, 0])
-    seen = replace(labelled(cut=False, hidden=False), up=up)
+    seen = replace(labelled(truncated=False, occluded=False), up=up)
     views: Any = [(seen, frame(), None)]
     finished: Any = SimpleNamespace(categories=())
     write_kitti(tmp_path, views, finished)
@@ -142,7 +142,7 @@ def test_kitti_calibration_projects_points_into_colour_camera(tmp_path: Path) ->
     data = np.zeros((150, 200, 3), np.uint8).tobytes()
     image = ColourImage("/color", 5, 6, "color", "rgb8", 200, 150, 600, data)
     view = ColourView(image, LensCamera(camera), pose)
-    views: Any = [(labelled(cut=False, hidden=False), frame(), Coloured(view, ()))]
+    views: Any = [(labelled(truncated=False, occluded=False), frame(), Coloured(view, ()))]
     finished: Any = SimpleNamespace(categories=())
     assert write_kitti(tmp_path, views, finished) == 1
 
@@ -158,7 +158,7 @@ def test_kitti_calibration_projects_points_into_colour_camera(tmp_path: Path) ->
     (tmp_path / "frames.csv").write_text("number,topic,frame,stamp_ns\n000000,/depth,0,5\n")
     found = KittiLabels(tmp_path, ["bowl"]).at(("/depth", 0), 5)
     assert found is not None
-    back, item = found.items[0].box, labelled(cut=False, hidden=False).objects[0]
+    back, item = found.items[0].box, labelled(truncated=False, occluded=False).objects[0]
     assert back is not None
     assert_allclose(back.center, item.box.center, atol=2e-5)
     error = Rotation.from_quat(back.orientation).inv() * Rotation.from_quat(item.box.orientation)
@@ -184,7 +184,7 @@ def test_kitti_image_is_that_of_its_pinhole_camera(tmp_path: Path) -> None:
     pixels[v - 1 : v + 2, u - 1 : u + 2] = 255
     image = ColourImage("/color", 5, 6, "color", "rgb8", 200, 150, 600, pixels.tobytes())
     view = ColourView(image, LensCamera(camera, "plumb_bob", lens), pose)
-    views: Any = [(labelled(cut=False, hidden=False), frame(), Coloured(view, ()))]
+    views: Any = [(labelled(truncated=False, occluded=False), frame(), Coloured(view, ()))]
     finished: Any = SimpleNamespace(categories=())
     write_kitti(tmp_path, views, finished)
 
@@ -201,7 +201,7 @@ def test_kitti_image_on_depth_pixels_has_the_depth_camera(tmp_path: Path) -> Non
     image = ColourImage("/color", 5, 6, "optical", "rgb8", 160, 120, 480, pixels.tobytes())
     lens = LensCamera(Camera(160, 120, 144.1, 140.3, 76.2, 62.8), "plumb_bob", (0.02, 0, 0, 0, 0))
     coloured = Coloured(ColourView(image, lens), ())
-    views: Any = [(labelled(cut=False, hidden=False), frame(), coloured)]
+    views: Any = [(labelled(truncated=False, occluded=False), frame(), coloured)]
     finished: Any = SimpleNamespace(categories=())
     write_kitti(tmp_path, views, finished)
 
@@ -229,7 +229,7 @@ def test_kitti_2d_box_is_clipped_to_colour_image(
         "/color", 5, 6, "color", "rgb8", width, height, 3 * width, bytes(3 * width * height)
     )
     coloured = Coloured(ColourView(image, LensCamera(camera), IDENTITY), ())
-    views: Any = [(labelled(cut=False, hidden=False), frame(), coloured)]
+    views: Any = [(labelled(truncated=False, occluded=False), frame(), coloured)]
     finished: Any = SimpleNamespace(categories=())
     write_kitti(tmp_path, views, finished)
 
@@ -241,7 +241,9 @@ def labelcloud(folder: Path) -> None:
         categories=("cup", "bowl"), info={"versions": {"shapecat": "0"}}, labels={}
     )
     assert (
-        write_labelcloud(folder, [(labelled(cut=False, hidden=False), frame(), None)], finished)
+        write_labelcloud(
+            folder, [(labelled(truncated=False, occluded=False), frame(), None)], finished
+        )
         == 1
     )
 
@@ -278,7 +280,7 @@ def test_labelcloud_boxes_and_clouds_share_a_frame(tmp_path: Path) -> None:
     level_from_sensor = Rotation.from_quat([x, y, z, w])
     assert_allclose(level_from_sensor.apply(frame().xyz()), points, atol=1e-5)
     assert_allclose(level_from_sensor.apply(UP), [0, 0, 1], atol=1e-5)
-    source = labelled(cut=False, hidden=False).objects[0].box
+    source = labelled(truncated=False, occluded=False).objects[0].box
     rotation = Rotation.from_quat(source.orientation)
     unit = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / 2
     wanted = level_from_sensor.apply(rotation.apply(unit * source.size) + source.center)
@@ -296,7 +298,7 @@ def test_kitti_2d_box_of_cloud_is_minus_one(tmp_path: Path) -> None:
     """An unorganised cloud has no image; the specification asks for -1."""
     points = frame().xyz()
     cloud = Frame("/scan", 0, 5, 6, "laser", points=points)
-    views: Any = [(labelled(cut=False, hidden=False), cloud, None)]
+    views: Any = [(labelled(truncated=False, occluded=False), cloud, None)]
     finished: Any = SimpleNamespace(categories=())
     write_kitti(tmp_path, views, finished)
 
@@ -307,7 +309,9 @@ def test_kitti_2d_box_of_cloud_is_minus_one(tmp_path: Path) -> None:
 def test_kitti_keeps_cloud_of_level_lidar(tmp_path: Path) -> None:
     """Taken for a camera that looks up, a level lidar would have its cloud turned on its side."""
     points = np.array([[4.0, 1.0, -0.5], [2.0, -3.0, 0.25]], np.float32)
-    level = replace(labelled(cut=False, hidden=False), up=np.array([0.0, 0.0, 1.0]), objects=())
+    level = replace(
+        labelled(truncated=False, occluded=False), up=np.array([0.0, 0.0, 1.0]), objects=()
+    )
     views: Any = [(level, Frame("/scan", 0, 5, 6, "laser", points=points), None)]
     finished: Any = SimpleNamespace(categories=())
     write_kitti(tmp_path, views, finished)
@@ -322,7 +326,7 @@ def test_kitti_turns_loose_points_of_camera_like_its_image(tmp_path: Path) -> No
     found = []
     for name, seen in (("image", frame()), ("cloud", cloud)):
         (tmp_path / name).mkdir()
-        views: Any = [(labelled(cut=False, hidden=False), seen, None)]
+        views: Any = [(labelled(truncated=False, occluded=False), seen, None)]
         write_kitti(tmp_path / name, views, finished)
         found.append(read_points(tmp_path / name))
 
@@ -346,7 +350,7 @@ def crops_run(*topics: str, name: str = "lab", **options: float | None) -> Any:
 
 
 def crops_frames(*topics: str) -> list[Any]:
-    one = labelled(cut=False, hidden=False)
+    one = labelled(truncated=False, occluded=False)
     return [(replace(one, topic=topic), replace(frame(), topic=topic), None) for topic in topics]
 
 
@@ -419,12 +423,15 @@ def test_crops_do_not_replace_those_of_more_frames(tmp_path: Path, first: Any, s
 
 def dataset_image() -> DatasetImage:
     """Return an image of 40 x 20 pixels with two objects; the second label is uncertain."""
-    first, second = labelled(cut=False, hidden=True).objects[0], labelled(cut=True, hidden=False)
+    first, second = (
+        labelled(truncated=False, occluded=True).objects[0],
+        labelled(truncated=True, occluded=False),
+    )
     corner = np.zeros((6, 8), bool)
     corner[:2], corner[:, :3] = True, True  # 16 pixels above, and 12 of the foot below
     masks = (Mask(20, 5, corner), Mask(1, 2, np.ones((3, 4), bool)))
     uncertain = replace(second.objects[0], track=9, category="cup", confidence=0.4)
-    view = labelled(cut=False, hidden=False)
+    view = labelled(truncated=False, occluded=False)
     objects = tuple(map(DatasetObject, (first, uncertain), masks, (True, False)))
     return DatasetImage("a.jpg", b"jpeg", 40, 20, view, objects)
 
@@ -501,7 +508,7 @@ def test_yaml_files_hold_names_as_they_are_written(tmp_path: Path) -> None:
     run: Any = SimpleNamespace(folder=tmp_path, labels={}, categories=("can", "𠮷 cup"))
     write_yolo(tmp_path, [], run.categories)
     cloud = Frame("/depth", 0, 5, 6, "optical", points=np.ones((2, 3), np.float32))
-    empty = replace(labelled(cut=False, hidden=False), objects=())
+    empty = replace(labelled(truncated=False, occluded=False), objects=())
     write_point_labels(tmp_path, [(empty, cloud, None)], run)
 
     assert '  1: "𠮷 cup"\n' in (tmp_path / "data.yaml").read_text("utf-8")
@@ -510,7 +517,7 @@ def test_yaml_files_hold_names_as_they_are_written(tmp_path: Path) -> None:
 
 def test_tiny_negative_yaw_is_not_written_as_360_degrees() -> None:
     """The remainder of a negative rounding error is 360 itself, which labelCloud cannot show."""
-    item = labelled(cut=False, hidden=False).objects[0]
+    item = labelled(truncated=False, occluded=False).objects[0]
     for yaw in (-1e-12, 0.0, 1e-12):
         half = np.array([0, 0, np.sin(yaw / 2), np.cos(yaw / 2)])
         rotated = replace(item, box=Box(np.zeros(3), SIZE, half))
@@ -522,7 +529,9 @@ def test_data_set_files_have_frames_runs_and_categories(tmp_path: Path) -> None:
 
     Ultralytics would resolve a relative "path" in data.yaml against the current directory.
     """
-    view = replace(labelled(cut=False, hidden=False), topic="/left", index=17, stamp_ns=12_345)
+    view = replace(
+        labelled(truncated=False, occluded=False), topic="/left", index=17, stamp_ns=12_345
+    )
     second = replace(dataset_image(), name="b.jpg", labelled=view)
     other = finished("runs/hall", "h")
     images: Any = [
@@ -603,7 +612,7 @@ def test_labelcloud_formats_hold_same_box_in_their_units(tmp_path: Path) -> None
 
 def test_kitti_lists_frame_of_each_number(tmp_path: Path) -> None:
     """Only this list leads from a label back to its frame."""
-    view = labelled(cut=False, hidden=False)
+    view = labelled(truncated=False, occluded=False)
     other = replace(view, topic="/left", index=17, stamp_ns=12_345, objects=())
     views: Any = [(view, frame(), None), (other, frame(), None)]
     finished: Any = SimpleNamespace(categories=())
@@ -628,7 +637,7 @@ def test_kitti_2d_box_is_that_of_the_image_that_is_written(
     view = ColourView(image, None if without == "lens" else lens, pose)
     folders = tmp_path / "with", tmp_path / "alone"
     for folder, coloured in zip(folders, (Coloured(view, ()), None), strict=True):
-        views: Any = [(labelled(cut=False, hidden=False), frame(), coloured)]
+        views: Any = [(labelled(truncated=False, occluded=False), frame(), coloured)]
         finished: Any = SimpleNamespace(categories=())
         folder.mkdir()
         write_kitti(folder, views, finished)

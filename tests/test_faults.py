@@ -12,7 +12,7 @@ import pytest
 from shapecat.pipeline import process
 from shapecat.runs.jobs import Job
 from tests.faults import invariants
-from tests.faults.cases import Laboratory, SkippedError
+from tests.faults.cases import FaultRunner, SkippedError
 from tests.faults.injection import Ended
 from tests.faults.scenarios import SCENARIOS, Scenario
 from tests.scenes import record
@@ -25,24 +25,24 @@ CASES = (
 
 
 @pytest.fixture(scope="module")
-def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Laboratory:
+def runner(tmp_path_factory: pytest.TempPathFactory) -> FaultRunner:
     chosen = tuple(s for s in SCENARIOS if s.name == "single")
-    return Laboratory(tmp_path_factory.mktemp("faults"), chosen)
+    return FaultRunner(tmp_path_factory.mktemp("faults"), chosen)
 
 
 @pytest.mark.many
 @pytest.mark.parametrize(("kind", "seed"), CASES)
-def test_fault_does_no_harm(laboratory: Laboratory, kind: str, seed: int) -> None:
+def test_fault_does_no_harm(runner: FaultRunner, kind: str, seed: int) -> None:
     """A fault could leave half a result, lose work, or prevent the command from resuming.
 
     Of the quick tests, `test_stopping` interrupts, `test_crash` kills and fills the disk.
     """
     try:
-        verdict = laboratory.judge(kind, seed)
+        verdict = runner.judge(kind, seed)
     except SkippedError as error:
         pytest.skip(str(error))
 
-    assert not verdict.wrong, verdict
+    assert not verdict.violations, verdict
 
 
 @pytest.fixture(scope="module")

@@ -130,7 +130,7 @@ def test_cache_folder_is_writable_or_configured(
 
 
 @pytest.fixture
-def no_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+def temporary_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Make the user's cache unwritable; return the temporary folder, the last resort."""
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
     temporary = tmp_path / "tmp"
@@ -140,45 +140,47 @@ def no_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def test_user_who_can_write_nowhere_uses_compiled_kernels(
-    stage: Path, run: Run, no_home: Path, monkeypatch: pytest.MonkeyPatch
+    stage: Path, run: Run, temporary_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A container run as an arbitrary user compiled for a minute at each start."""
     assert run() == "7 0"
-    assert not [*no_home.iterdir()], "nothing was needed there"
+    assert not [*temporary_cache.iterdir()], "nothing was needed there"
     for folder, *_ in os.walk(stage / "__pycache__", topdown=False):
         Path(folder).chmod(0o555)
     access = os.access
     monkeypatch.setattr(
-        os, "access", lambda path, mode: str(no_home) in str(path) and access(path, mode)
+        os, "access", lambda path, mode: str(temporary_cache) in str(path) and access(path, mode)
     )
     assert run() == "7 1"
-    (own,) = no_home.iterdir()
+    (own,) = temporary_cache.iterdir()
     assert {Path(folder).stat().st_mode & 0o700 for folder, *_ in os.walk(own)} == {0o700}
     assert own.stat().st_mode & 0o077 == 0
     assert [*own.glob("stage-*/kernels-*")]
     assert not [*own.glob("stage-*/copy-*")]
 
 
-@pytest.mark.usefixtures("no_home")
+@pytest.mark.usefixtures("temporary_cache")
 def test_kernels_are_cached_for_the_next_start_without_home(stage: Path, run: Run) -> None:
     stage.joinpath("__pycache__").write_text("")
     assert run() == "7 0"
     assert run() == "7 1"
 
 
-def test_machine_code_of_others_is_not_loaded(stage: Path, run: Run, no_home: Path) -> None:
+def test_machine_code_of_others_is_not_loaded(stage: Path, run: Run, temporary_cache: Path) -> None:
     """Any user can make another user's folder in /tmp first, and put code into it."""
     stage.joinpath("__pycache__").write_text("")
-    (no_home / f"shapecat-{os.getuid()}").mkdir()
-    (no_home / f"shapecat-{os.getuid()}").chmod(0o777)
+    (temporary_cache / f"shapecat-{os.getuid()}").mkdir()
+    (temporary_cache / f"shapecat-{os.getuid()}").chmod(0o777)
     assert run() == "7 0"
     assert run() == "7 0"
 
 
-def test_kernel_is_compiled_without_any_cache_folder(stage: Path, run: Run, no_home: Path) -> None:
+def test_kernel_is_compiled_without_any_cache_folder(
+    stage: Path, run: Run, temporary_cache: Path
+) -> None:
     """Slow is better than an error."""
     stage.joinpath("__pycache__").write_text("")
-    no_home.rmdir()
+    temporary_cache.rmdir()
     assert run() == "7 0"
 
 

@@ -84,13 +84,13 @@ def make_run(
     size: float | tuple[float, float, float] = 0.08,
     first_size: tuple[float, float, float] | None = None,
     labels: Mapping[int, str] | None = None,
-    alike: int = 1,
-    right: Collection[int] = (),
+    frames_per_stamp: int = 1,
+    tracks_of_other_camera: Collection[int] = (),
 ) -> Path:
     """Write the tables of a run whose tracks are at the given positions.
 
-    ``alike`` is the number of successive frames with the same stamp. Another camera, with the same
-    stamps and frame numbers, sees the tracks in ``right``.
+    ``frames_per_stamp`` is the number of successive frames with the same stamp. Another camera,
+    with the same stamps and frame numbers, sees the ``tracks_of_other_camera``.
     """
     folder.mkdir(parents=True)
     work = work or f"w{folder.name}"
@@ -104,9 +104,9 @@ def make_run(
         for frame, place in enumerate(path)
         if place is not None
     ]
-    stamps = [1_000 + 33 * (frame // alike) for _, frame, _ in rows]
+    stamps = [1_000 + 33 * (frame // frames_per_stamp) for _, frame, _ in rows]
     counts: dict[tuple[str, int], int] = {}
-    topics = ["/right" if track in right else "/depth" for track, _, _ in rows]
+    topics = ["/right" if track in tracks_of_other_camera else "/depth" for track, _, _ in rows]
     detections = []
     for key in zip(topics, (frame for _, frame, _ in rows), strict=True):
         detections.append(counts.get(key, 0))
@@ -301,8 +301,8 @@ def test_skipped_frames_do_not_count_against_a_match(tmp_path: Path) -> None:
 def test_frames_with_equal_stamps_are_told_apart(tmp_path: Path) -> None:
     """If each message is recorded twice, no label would have a majority of the frames."""
     objects = {1: static(CUP), 2: static(CAN)}
-    source = make_run(tmp_path / "source", objects, labels={1: "mug", 2: "tin"}, alike=2)
-    target = make_run(tmp_path / "target", objects, alike=2)
+    source = make_run(tmp_path / "source", objects, labels={1: "mug", 2: "tin"}, frames_per_stamp=2)
+    target = make_run(tmp_path / "target", objects, frames_per_stamp=2)
 
     transfer_labels(source, target)
 
@@ -313,8 +313,8 @@ def test_tracks_of_two_cameras_are_told_apart(tmp_path: Path) -> None:
     """Frames of two cameras may have equal numbers and stamps: objects of one would be lost."""
     objects = {1: static(CUP), 2: static(CAN), 3: static(shifted(CUP, x=0.4))}
     labels = {1: "mug", 2: "tin", 3: "bowl"}
-    source = make_run(tmp_path / "source", objects, labels=labels, right={2})
-    target = make_run(tmp_path / "target", objects, right={2})
+    source = make_run(tmp_path / "source", objects, labels=labels, tracks_of_other_camera={2})
+    target = make_run(tmp_path / "target", objects, tracks_of_other_camera={2})
 
     transfer_labels(source, target)
 

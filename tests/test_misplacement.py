@@ -22,25 +22,27 @@ TURN = np.array([[0.0, 0.8, 0.6], [-1.0, 0.0, 0.0], [0.0, -0.6, 0.8]])
 def write_run(
     folder: Path,
     speed_m_s: float,
-    axes: F8,
-    carried_m_s: float = 0,
+    rotation_error: F8,
+    object_speed_m_s: float = 0,
     *,
     cells: int = 1,
     empty: Container[int] = range(2, 130, 7),
 ) -> None:
-    """Write the tables of a camera that drives along x, with an error ``axes`` (3, 3) in rotation.
+    """Write the tables of a camera that drives along x, with a ``rotation_error`` (3, 3).
 
-    Objects move along x at ``carried_m_s``; the frames ``empty`` have none. There are ``cells``
-    equal rooms, each with such a camera.
+    Objects move along x at ``object_speed_m_s``; the frames ``empty`` have none. There are
+    ``cells`` equal rooms, each with such a camera.
     """
     rows: dict[str, list[Any]] = {"topic": [], "center": [], "center_fixed": [], "frame": []}
     frames = range(130)
     for k in (k for k in frames if k not in empty):
         place = np.array([0.1 * k * speed_m_s, -0.2, 1.3])
-        own = (OBJECTS + np.array([0.1 * k * carried_m_s, 0, 0]) - place) @ TURN
+        own = (OBJECTS + np.array([0.1 * k * object_speed_m_s, 0, 0]) - place) @ TURN
         for cell in range(cells):
             rows["center"] += own.tolist()
-            rows["center_fixed"] += (own @ axes @ TURN.T + place + [0, 3.0 * cell, 0]).tolist()
+            rows["center_fixed"] += (
+                own @ rotation_error @ TURN.T + place + [0, 3.0 * cell, 0]
+            ).tolist()
             rows["frame"] += [k] * len(own)
             rows["topic"] += [f"/depth{cell or ''}"] * len(own)
     seen: dict[str, list[Any]] = {
@@ -59,7 +61,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 @pytest.mark.parametrize(
-    ("speed_m_s", "axes", "carried_m_s", "warns"),
+    ("speed_m_s", "rotation_error", "object_speed_m_s", "warns"),
     [
         (0.2, OPENGL, 0, True),
         (0.2, np.eye(3), 0, False),
@@ -69,10 +71,10 @@ OPENGL = np.diag([1.0, -1.0, -1.0])
     ],
 )
 def test_poses_that_are_worse_than_none_are_reported(
-    tmp_path: Path, speed_m_s: float, axes: F8, carried_m_s: float, *, warns: bool
+    tmp_path: Path, speed_m_s: float, rotation_error: F8, object_speed_m_s: float, *, warns: bool
 ) -> None:
     """In a map with y up, wrong axes of the sensor's frame go unnoticed: tracks drift, or end."""
-    write_run(tmp_path, speed_m_s, axes, carried_m_s)
+    write_run(tmp_path, speed_m_s, rotation_error, object_speed_m_s)
 
     warnings = list(explain_misplacement(tmp_path, "map"))
     assert [w.split(":")[0] for w in warnings] == ["/depth"] * warns
@@ -97,12 +99,14 @@ def test_frames_two_seconds_apart_are_not_compared(
     assert len(list(explain_misplacement(tmp_path, "map"))) == warns
 
 
-@pytest.mark.parametrize(("axes", "topics"), [(np.eye(3), []), (OPENGL, ["/depth", "/depth1"])])
+@pytest.mark.parametrize(
+    ("rotation_error", "topics"), [(np.eye(3), []), (OPENGL, ["/depth", "/depth1"])]
+)
 def test_sensors_are_not_compared_with_each_other(
-    tmp_path: Path, axes: F8, topics: list[str]
+    tmp_path: Path, rotation_error: F8, topics: list[str]
 ) -> None:
     """Two robots in equal cells see the same, at places far from each other."""
-    write_run(tmp_path, 0.2, axes, cells=2)
+    write_run(tmp_path, 0.2, rotation_error, cells=2)
 
     warnings = list(explain_misplacement(tmp_path, "map"))
     assert [w.split(":")[0] for w in warnings] == topics

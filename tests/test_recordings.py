@@ -671,7 +671,7 @@ def test_unreadable_file_gives_one_line_error(
     assert "\n" not in str(caught.value)
 
 
-def test_pipe_in_a_folder_is_no_recording(tmp_path: Path) -> None:
+def test_pipe_is_not_opened_as_recording(tmp_path: Path) -> None:
     """Opening a pipe waits for its writer; a pipe among recordings would stop the whole run."""
     os.mkfifo(tmp_path / "pipe.mcap")
     writer = os.open(tmp_path / "pipe.mcap", os.O_RDWR)  # so that a failing test ends

@@ -500,7 +500,9 @@ def test_calibration_recorded_once_is_used_for_all_images(tmp_path: Path, first_
 
 
 @pytest.mark.parametrize("zeros", [(0,), (0, 1), (1,), (2,), (0, 1, 2)])
-def test_calibrations_of_zeros_do_not_replace_one(tmp_path: Path, zeros: Sequence[int]) -> None:
+def test_calibration_of_zeros_does_not_replace_valid_one(
+    tmp_path: Path, zeros: Sequence[int]
+) -> None:
     """Some drivers publish zeros at first; a valid calibration of another time is better."""
     items: list[tuple[str, int, Any]] = []
     for k in range(3):

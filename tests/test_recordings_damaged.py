@@ -175,7 +175,7 @@ def test_damaged_index_of_a_chunk_is_not_used(tmp_path: Path, damage: str, wante
         assert recording.warnings == []  # nothing is missing
 
 
-def test_damage_is_reported_once_in_whatever_part_of_a_chunk(tmp_path: Path) -> None:
+def test_damaged_chunk_is_reported_once_however_much_of_it_is_read(tmp_path: Path) -> None:
     """A wrong length is found in part of a chunk, a wrong checksum in all of it: two warnings."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, compression=CompressionType.NONE) as writer:
@@ -529,7 +529,7 @@ def test_database_is_read_up_to_where_it_ends_too_early(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
-def test_folder_named_like_a_part_is_none(tmp_path: Path, plugin: StoragePlugin) -> None:
+def test_folder_named_like_a_part_is_not_read_as_one(tmp_path: Path, plugin: StoragePlugin) -> None:
     """A subfolder old.mcap or old.db3 made a bag unreadable, with a misleading error."""
     bag = write_folder(tmp_path / "bag", plugin)
     (bag / "metadata.yaml").unlink()

@@ -76,7 +76,7 @@ def test_calibration_below_the_topic_of_its_images_is_found(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("colour_info", ["camera_info", "color_camera_info"])
-def test_calibration_with_the_word_of_its_images_is_found(tmp_path: Path, colour_info: str) -> None:
+def test_calibration_named_after_its_images_is_found(tmp_path: Path, colour_info: str) -> None:
     """depth_image belongs to depth_camera_info, but silently got colour intrinsics, or none."""
     items = depth_in("/head/depth_image", "optical")
     items[0] = ("/head/depth_camera_info", *items[0][1:])
@@ -361,7 +361,7 @@ def test_streams_are_compared_in_pairs_only(monkeypatch: pytest.MonkeyPatch) -> 
     assert parsed["_place"] == count
 
 
-def test_sensor_that_shares_more_keeps_its_colour() -> None:
+def test_colour_belongs_to_sensor_with_most_topic_parts_in_common() -> None:
     """Colour images belong to the sensor whose topic name has the most parts in common."""
     left, right, far = (
         Stream(topic, IMAGE, "depth", "/info", 1, topic)

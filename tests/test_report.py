@@ -610,7 +610,7 @@ def test_corrections_made_in_browser_are_adopted(
     assert labels[a].category == labels[d].category == other
     assert (labels[d].track, labels[c].category, labels[e].confidence) == (a, "Weingläser", 1.0)
     assert b not in labels
-    assert browser.complaints() == []
+    assert browser.console_messages() == []
 
     Reports([replace(drawn, folder=run)]).write()
     browser.open(page)
@@ -641,7 +641,7 @@ def test_new_page_keeps_corrections_not_downloaded(
     browser.open(page)
 
     assert changes(browser) == {a: "→ delete", b: "→ teapot"}
-    assert browser.complaints() == []
+    assert browser.console_messages() == []
 
 
 def test_label_that_is_cleared_after_download_is_cleared_in_run(
@@ -672,11 +672,11 @@ def test_two_tabs_keep_corrections_of_both(browser: Browser, reported_run: Path)
     browser.open(page)
     browser.click(f"#track-{c} button[data-label='delete']")
     one, two = browser.tabs()[0], browser.tab()
-    browser.turn_to(two)
+    browser.switch_to(two)
     browser.open(page)
-    browser.turn_to(one)
+    browser.switch_to(one)
     browser.click(f"#track-{a} button[data-label='delete']")
-    browser.turn_to(two)
+    browser.switch_to(two)
     browser.click(f"#track-{b} button[data-label='delete']")
     browser.click(f"#track-{c} button[data-label='delete']")  # clears it
     browser.open(page)
@@ -901,7 +901,7 @@ def test_filters_select_cards(browser: Browser, reported_run: Path) -> None:
     assert browser.run(display) == "block"
     browser.click("#meshes")
     assert browser.run(display) == "none"
-    assert browser.complaints() == []
+    assert browser.console_messages() == []
 
 
 def test_keys_label_no_hidden_card(browser: Browser, reported_run: Path) -> None:
@@ -925,7 +925,7 @@ def test_keys_label_no_hidden_card(browser: Browser, reported_run: Path) -> None
     browser.run("document.activeElement.blur()")
     browser.press("d")
     assert changes(browser) == {shown: "→ delete", rows[0].track: "→ delete"}
-    assert browser.complaints() == []
+    assert browser.console_messages() == []
 
 
 def test_text_is_readable_in_both_themes(browser: Browser, reported_run: Path) -> None:

@@ -94,4 +94,4 @@ def test_counts_follow_corrections_on_the_page(
     undone = browser.run(script)
     assert undone[:2] == before[:2]
     assert {n: k for n, k in undone[2] if k} == {n: k for n, k in before[2] if k}
-    assert browser.complaints() == []
+    assert browser.console_messages() == []

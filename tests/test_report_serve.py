@@ -125,7 +125,7 @@ def test_keyboard_corrections_survive_restart_of_server(browser: Browser, long_r
 
     assert len(wanted) == TRACKS
     assert on_disk == wanted
-    assert browser.complaints() == []
+    assert browser.console_messages() == []
 
     script = (
         "return Object.fromEntries([...document.querySelectorAll('.card.changed')].map("
@@ -445,14 +445,14 @@ def test_two_tabs_do_not_overwrite_each_other(
     with serving(run, drawn) as (address, _):
         browser.open(address)
         one, two = browser.tabs()[0], browser.tab()
-        browser.turn_to(two)
+        browser.switch_to(two)
         browser.open(address)
         late = "addEventListener('focus', (event) => event.stopImmediatePropagation(), true)"
         browser.run(late)  # or it would request the labels on focus
-        browser.turn_to(one)
+        browser.switch_to(one)
         browser.click(f"#track-{first} [data-label='unknown']")
         browser.wait(SAVED)
-        browser.turn_to(two)
+        browser.switch_to(two)
         browser.click(f"#track-{first} [data-label='delete']")
         browser.wait("return document.querySelector('#said').textContent.includes('not changed')")
         fix = f"return document.querySelector('#track-{first} .fix').textContent"
@@ -465,7 +465,7 @@ def test_two_tabs_do_not_overwrite_each_other(
         browser.click(f"#track-{second} [data-label='unknown']")
         browser.wait(SAVED)
         browser.close_tab()
-        browser.turn_to(one)
+        browser.switch_to(one)
         browser.click(f"#track-{third} [data-label='unknown']")
         browser.wait(SAVED)
         browser.wait(f"{fix} === '→ delete'")  # the answer includes the labels of the other tab
@@ -556,4 +556,4 @@ def test_keys_undo_move_and_open(browser: Browser, reported_run: Path) -> None:
     assert browser.run("return document.querySelectorAll('#stage .box').length") > 0
     browser.press("Escape")
     browser.wait("return !document.getElementById('large').open")
-    assert browser.complaints() == []
+    assert browser.console_messages() == []

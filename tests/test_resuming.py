@@ -321,7 +321,7 @@ def test_labels_given_while_outputs_are_written_are_transferred(
 
 
 @pytest.mark.usefixtures("perceiving_fails")
-def test_outputs_of_a_killed_annotation_are_written_as_it_was_asked_to(
+def test_outputs_of_killed_annotation_are_completed_with_its_options(
     job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Otherwise they would have the old labels and boxes, and the old path of the recording."""

@@ -41,7 +41,7 @@ TOPIC = "/depth/image_raw"
 COUNT = 40
 DISTURBED = (7, 16, 17, 31)
 MANY = tuple(range(3, COUNT, 4))
-SHORTLY, BRIEF = 25, tuple(range(20, 24))
+BRIEF_LABEL, BRIEF = 25, tuple(range(20, 24))
 """The label of an object that only a tenth of the frames show if ``brief``, and those frames."""
 BLOCKS = Settings(reuse_frames=4)
 """Shorter blocks than usual, so that several are perceived again."""
@@ -92,7 +92,7 @@ def items(
         depth, labels, camera, pose = sequence[k % len(sequence)]
         stamp = EPOCH + k * PERIOD
         if brief and k not in BRIEF:
-            depth = np.where(labels == SHORTLY, np.float32(0), depth)
+            depth = np.where(labels == BRIEF_LABEL, np.float32(0), depth)
         if poses:
             turned = (
                 pose

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
 
-from tests.faults.cases import Laboratory, SkippedError, Verdict
+from tests.faults.cases import FaultRunner, SkippedError, Verdict
 from tests.faults.injection import KINDS
 from tests.faults.scenarios import SCENARIOS
 
@@ -23,10 +23,10 @@ def main(words: list[str] | None = None) -> int:
     scenarios = tuple(s for s in SCENARIOS if options.jobs in {None, s.jobs} or s.name == "single")
     with tempfile.TemporaryDirectory(prefix="shapecat-faults-") as store:
         until = time.monotonic() + 60 * options.minutes
-        laboratory = Laboratory(Path(store), scenarios)
+        runner = FaultRunner(Path(store), scenarios)
         print(f"undisturbed runs done, {len(scenarios)} scenarios", flush=True)
         with ThreadPoolExecutor(options.at_once) as pool:
-            judged = pool.map(lambda case: _judge(laboratory, case, until), _cases(options))
+            judged = pool.map(lambda case: _judge(runner, case, until), _cases(options))
             verdicts = [*judged]
     return _print(verdicts)
 
@@ -55,24 +55,24 @@ def _cases(options: argparse.Namespace) -> Iterator[tuple[str, int]]:
     return islice(((kind, seed) for seed in seeds for kind in kinds), options.count)
 
 
-def _judge(laboratory: Laboratory, case: tuple[str, int], until: float) -> Verdict | str:
+def _judge(runner: FaultRunner, case: tuple[str, int], until: float) -> Verdict | str:
     """Judge a case; return the reason if it is skipped."""
     if time.monotonic() > until:
         return "no time left"
     try:
-        verdict = laboratory.judge(*case)
+        verdict = runner.judge(*case)
     except SkippedError as error:
         return f"{case[0]}: {error}"
-    if verdict.wrong:
+    if verdict.violations:
         print(_describe(verdict), flush=True)
     return verdict
 
 
 def _describe(verdict: Verdict) -> str:
-    moment = "" if verdict.struck is None else f" at {verdict.struck:.2f} s"
+    moment = "" if verdict.fault_s is None else f" at {verdict.fault_s:.2f} s"
     head = f"{verdict.kind} --only {verdict.seed} ({verdict.scenario}){moment}: exit {verdict.code}"
     lines = [line for line in verdict.stderr.splitlines() if not line.startswith('{"event": "prog')]
-    return "\n    ".join([head, *verdict.wrong, "stderr:", *lines[-6:]])
+    return "\n    ".join([head, *verdict.violations, "stderr:", *lines[-6:]])
 
 
 def _print(results: list[Verdict | str]) -> int:
@@ -80,7 +80,7 @@ def _print(results: list[Verdict | str]) -> int:
     tries = Counter(verdict.kind for verdict in verdicts)
     failed: dict[str, list[int]] = defaultdict(list)
     for verdict in verdicts:
-        if verdict.wrong:
+        if verdict.violations:
             failed[verdict.kind].append(verdict.seed)
     print(f"\n{'kind':<12}{'tries':>6}{'held':>6}  failed seeds")
     for kind, count in tries.items():

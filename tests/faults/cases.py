@@ -21,17 +21,17 @@ class SkippedError(Exception):
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcome of a case: what is ``wrong``, and exit code and stderr of the disturbed command.
+    """A case: violated invariants, and exit code and stderr of the disturbed command.
 
-    ``struck`` is the time of the fault, seconds after the start, if it was set in advance.
+    ``fault_s`` is the time of the fault, seconds after the start, if it was set in advance.
     """
 
     kind: str
     seed: int
     scenario: str
-    wrong: tuple[str, ...]
+    violations: tuple[str, ...]
     code: int
-    struck: float | None
+    fault_s: float | None
     stderr: str
 
 
@@ -42,7 +42,7 @@ class _Reference:
     calls: tuple[int, ...]
 
 
-class Laboratory:
+class FaultRunner:
     """Keeps the recordings and one undisturbed run of each scenario."""
 
     def __init__(self, store: Path, scenarios: tuple[Scenario, ...] = SCENARIOS) -> None:
@@ -85,14 +85,14 @@ class Laboratory:
         try:
             scenario.prepare(self.store, case)
             ended = self._disturbed(kind, rng, scenario, case)
-            wrong = [*self._after_fault(kind, scenario, ended, case)]
+            violations = [*self._after_fault(kind, scenario, ended, case)]
             self._restore(kind, scenario, case)
-            wrong += self._again(kind, scenario, ended, case)
+            violations += self._again(kind, scenario, ended, case)
         finally:
             injection.unmount(case / "out")
             shutil.rmtree(case, ignore_errors=True)
         return Verdict(
-            kind, seed, scenario.name, tuple(wrong), ended.code, ended.struck, ended.text
+            kind, seed, scenario.name, tuple(violations), ended.code, ended.fault_s, ended.text
         )
 
     def _disturbed(self, kind: str, rng: random.Random, scenario: Scenario, case: Path) -> Ended:
@@ -115,24 +115,24 @@ class Laboratory:
         return injection.disturb(kind, rng, command, reference.seconds)
 
     def _after_fault(self, kind: str, scenario: Scenario, ended: Ended, case: Path) -> list[str]:
-        wrong = [*invariants.ended_well(kind, ended)]
-        wrong += invariants.complete_outputs(scenario, case / "out")
+        violations = [*invariants.ended_well(kind, ended)]
+        violations += invariants.complete_outputs(scenario, case / "out")
         if kind != "replace":
-            wrong += invariants.nothing_lost(scenario, ended, case / "out")
+            violations += invariants.nothing_lost(scenario, ended, case / "out")
         if scenario.verb == "export":
             reference = self.references[scenario.name].case / "crops"
             done = ended.code == 0
-            wrong += invariants.same_files(case / "crops", reference, all_there=done)
+            violations += invariants.same_files(case / "crops", reference, all_there=done)
         if ended.code == 0 and kind != "replace":
-            wrong += self._compared(scenario, case)
-        return wrong
+            violations += self._compared(scenario, case)
+        return violations
 
     def _compared(self, scenario: Scenario, case: Path) -> list[str]:
         reference = self.references[scenario.name].case
-        wrong = [*invariants.same_results(scenario.runs, case / "out", reference / "out")]
+        violations = [*invariants.same_results(scenario.runs, case / "out", reference / "out")]
         if scenario.verb == "export":
-            wrong += invariants.same_files(case / "crops", reference / "crops", all_there=True)
-        return wrong
+            violations += invariants.same_files(case / "crops", reference / "crops", all_there=True)
+        return violations
 
     def _restore(self, kind: str, scenario: Scenario, case: Path) -> None:
         if kind == "tmpfs":
@@ -146,11 +146,11 @@ class Laboratory:
         """Run the command again and return what is wrong; overwrite results of a replaced input."""
         options = ("--overwrite",) if kind == "replace" and ended.code == 0 else ()
         again = Running(scenario.command(case, *options)).end()
-        wrong = [f"exit code {again.code}: {again.text[-300:]}"] if again.code else []
-        wrong += invariants.complete_outputs(scenario, case / "out")
-        wrong += invariants.nothing_hidden(case)
-        wrong += self._compared(scenario, case)
-        return [f"again: {text}" for text in wrong]
+        violations = [f"exit code {again.code}: {again.text[-300:]}"] if again.code else []
+        violations += invariants.complete_outputs(scenario, case / "out")
+        violations += invariants.nothing_hidden(case)
+        violations += self._compared(scenario, case)
+        return [f"again: {text}" for text in violations]
 
 
 def _fits(kind: str, scenario: Scenario) -> bool:

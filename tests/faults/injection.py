@@ -34,14 +34,14 @@ _LINGER_S = 8.0
 class Ended:
     """The outcome of a command that has ended; times are in seconds after its start.
 
-    ``lines`` are those of stderr with their times, ``struck`` is the time of the fault, and
+    ``lines`` are those of stderr with their times, ``fault_s`` is the time of the fault, and
     ``lingering`` the number of processes that outlived the command.
     """
 
     code: int
     seconds: float
     lines: list[tuple[float, str]] = field(default_factory=list)
-    struck: float | None = None
+    fault_s: float | None = None
     lingering: int = 0
     hung: bool = False
 
@@ -99,7 +99,7 @@ class Running:
         with contextlib.suppress(ProcessLookupError):
             (os.killpg if group else os.kill)(self.process.pid, number)
 
-    def end(self, struck: float | None = None, limit_s: float = LIMIT_S) -> Ended:
+    def end(self, fault_s: float | None = None, limit_s: float = LIMIT_S) -> Ended:
         """Wait for the end of the command and of its processes; kill them if they take too long."""
         hung = self.wait_until(limit_s)
         if hung:
@@ -112,7 +112,7 @@ class Running:
         if left:
             self.send(signal.SIGKILL, group=True)
         self._reader.join(5.0)
-        return Ended(code, seconds, self.lines, struck, len(left), hung)
+        return Ended(code, seconds, self.lines, fault_s, len(left), hung)
 
 
 def session(leader: int) -> list[int]:

@@ -139,7 +139,7 @@ def complete_lines(manifest: Path) -> Iterator[str]:
 
 def nothing_lost(scenario: Scenario, ended: Ended, out: Path) -> Iterator[str]:
     """Check that the frames reported some seconds before the end are still there."""
-    last = ended.struck if ended.struck is not None else ended.seconds
+    last = ended.fault_s if ended.fault_s is not None else ended.seconds
     for name, count in reported(ended, last - RECENT_S).items():
         run = name.rpartition("/")[2].partition(".")[0]
         if run in scenario.runs and (found := kept_frames(out, run)) < count:
