@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from shapecat.description import DESCRIPTOR_NAMES
-from shapecat.errors import NoStreamError, OutputError, RecordingError
+from shapecat.errors import OutputError, RecordingError
 from shapecat.learning import load_model
 from shapecat.recordings import Recording, choose_streams, open_recording
 from shapecat.recordings.colour_streams import pair_colours
@@ -36,6 +36,7 @@ from shapecat.runs.jobs import (
     describe_run,
     differences,
     identify,
+    require_start_in_recording,
     require_model,
     require_other_folder,
     require_unchanged,
@@ -43,7 +44,12 @@ from shapecat.runs.jobs import (
     update_place,
 )
 from shapecat.runs.labels.corrections import adopt_labels, read_labels
-from shapecat.runs.labels.replaced import forget_old_labels, keep_labels, require_labels
+from shapecat.runs.labels.replaced import (
+    forget_old_labels,
+    keep_labels,
+    keep_last_labels,
+    require_labels,
+)
 from shapecat.runs.labels.transfer import Transfer, transfer_labels
 from shapecat.runs.perceive.doubts import explain_doubts
 from shapecat.runs.perceive.phases import Work, perceive_all, revise
@@ -88,7 +94,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
         categorizer.require_descriptor(DESCRIPTOR_NAMES)
         require_model(job, categorizer)
         run = describe_run(job, categorizer)
-        _require_start_in_recording(job, recording)
+        require_start_in_recording(job, recording)
         streams = choose_streams(recording, job.topics)
         run["options"]["topics"] = [stream.topic for stream in streams]
         colours = pair_colours(recording, streams, job.color)
@@ -101,7 +107,11 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
                 return _add_outputs(job, recording, run, content, observe)
             require_labels(job)
         require_resumable(job, run, content.result)
-        with staged(job.folder, worth_keeping=has_work) as folder:
+        with staged(
+            job.folder,
+            worth_keeping=has_work,
+            finish=lambda: keep_last_labels(folder, run, job),
+        ) as folder:
             run = resume(folder, run, job.source, content.result)
             if "perceive" not in run["seconds"]:
                 run = take_over_frames(job.folder, folder, run, job.source, content.result)
@@ -133,20 +143,6 @@ def _run_phases(work: Work, content: ContentDigest, begun: float) -> None:
     run["seconds"]["compile"] = compiling_s
     run["seconds"]["total"] = earlier_s + time.perf_counter() - begun
     write_run(folder, run)
-
-
-def _require_start_in_recording(job: Job, recording: Recording) -> None:
-    """Check that the selected range begins within the recording.
-
-    Raises
-    ------
-    NoStreamError : it begins after the end.
-    """
-    seconds = (recording.end_ns - recording.start_ns) * 1e-9
-    start_s = job.frame_range.start_s
-    if recording.end_ns and start_s is not None and start_s > seconds:
-        msg = f"{job.source}: --start {start_s:g} is after the end at {seconds:.1f} s"
-        raise NoStreamError(msg)
 
 
 def _revise_and_warn(work: Work) -> None:

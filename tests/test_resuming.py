@@ -15,7 +15,7 @@ from shapecat.errors import OutputError
 from shapecat.recordings import FrameRange
 from shapecat.runs.folder import previous_path, read_run, write_run
 from shapecat.runs.identity import file_stats
-from shapecat.runs.jobs import Job
+from shapecat.runs.jobs import Job, require_unchanged
 from shapecat.runs.labels.track_table import read_track_table
 from shapecat.runs.tables.segments import list_segments
 from shapecat.system.files import partial_path
@@ -318,6 +318,31 @@ def test_labels_given_while_outputs_are_written_are_transferred(
 
     assert written == [set(), {"vase"}]
     assert labels(job.folder) == {"vase"}
+
+
+@pytest.mark.usefixtures("perceiving_fails")
+@pytest.mark.parametrize("before", ["", "bowl"])
+def test_labels_given_until_the_run_is_replaced_are_transferred(
+    job: Job, monkeypatch: pytest.MonkeyPatch, before: str
+) -> None:
+    """The page of the replaced run accepts labels while the outputs are written a second time."""
+    job = replace(job, settings=changed("tracking.gate_m=0.1"), rrd=False, mcap=False)
+    give_label(job.folder, before)
+    checks = []
+
+    def check(*arguments: Any) -> None:
+        require_unchanged(*arguments)
+        checks.append(arguments)
+        if len(checks) == 2:  # after the outputs
+            give_label(job.folder, "vase")
+
+    monkeypatch.setattr(pipeline, "require_unchanged", check)
+    summary = pipeline.process(job)
+
+    assert labels(job.folder) == {"vase"}
+    assert summary.corrections is not None
+    assert [item["label"] for item in summary.corrections["transferred"]] == ["vase"]
+    assert read_run(job.folder).get("corrections") == summary.corrections
 
 
 @pytest.mark.usefixtures("perceiving_fails")

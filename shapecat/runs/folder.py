@@ -92,12 +92,15 @@ def staged(
     marker: Marker = made_by_run,
     *,
     worth_keeping: Callable[[Path], bool] = lambda _: False,
+    finish: Callable[[], None] = lambda: None,
 ) -> Iterator[Path]:
     """Provide a hidden folder; rename it to ``folder`` when the block succeeds.
 
     An earlier ``folder`` is moved away first and removed afterwards. After a signal or a kill, the
     hidden folder is kept, so that the same command can resume. After an error, it is kept if
     ``worth_keeping`` returns True for it. ``marker`` recognises folders that shapecat made.
+    ``finish`` is called before an earlier ``folder`` is moved away, when no other command can
+    change its labels or outputs any more.
 
     Raises
     ------
@@ -113,7 +116,7 @@ def staged(
         hidden.mkdir(parents=True, exist_ok=True)
         with holding(hidden, wait=False):
             yield hidden
-            _replace(folder, hidden, marker)
+            _replace(folder, hidden, marker, finish)
     except BusyError as error:
         msg = f"{folder}: another process is writing to this folder"
         raise OutputError(msg) from error
@@ -153,7 +156,7 @@ def _strangers(folder: Path, names: Collection[str]) -> Iterator[Path]:
     return (item for item in folder.iterdir() if item.name not in names)
 
 
-def _replace(folder: Path, hidden: Path, marker: Marker) -> None:
+def _replace(folder: Path, hidden: Path, marker: Marker, finish: Callable[[], None]) -> None:
     """Replace ``folder`` by the hidden one; at any moment, a complete folder exists.
 
     First wait for a command that writes outputs in the old folder: it would go on in the new one.
@@ -162,7 +165,8 @@ def _replace(folder: Path, hidden: Path, marker: Marker) -> None:
     if folder.exists():
         require_ours(folder, marker)
         outputs = folder / _OUTPUTS_LOCK
-        with holding(outputs) if outputs.exists() else nullcontext():
+        with holding(outputs) if outputs.exists() else nullcontext(), holding(folder):
+            finish()
             folder.rename(previous_path(folder))
     hidden.rename(folder)
     flush(folder.parent)

@@ -10,8 +10,9 @@ from typing import Any, cast
 
 from shapecat import __version__
 from shapecat.config import Settings
-from shapecat.errors import ModelError, OutputError, RecordingError
+from shapecat.errors import ModelError, NoStreamError, OutputError, RecordingError
 from shapecat.learning import Categorizer
+from shapecat.recordings import Recording
 from shapecat.recordings.files import input_size
 from shapecat.recordings.frames import ALL_FRAMES, FrameRange
 from shapecat.runs.folder import clear
@@ -32,6 +33,7 @@ __all__ = [
     "describe_run",
     "differences",
     "identify",
+    "require_start_in_recording",
     "require_model",
     "require_other_folder",
     "require_unchanged",
@@ -232,6 +234,20 @@ def update_place(run: RunInfo, found: InputInfo) -> bool:
     if moved:
         run["input"] |= {"path": found["path"], "files": found["files"]}
     return moved
+
+
+def require_start_in_recording(job: Job, recording: Recording) -> None:
+    """Check that the selected range begins within the recording.
+
+    Raises
+    ------
+    NoStreamError : it begins after the end.
+    """
+    seconds = (recording.end_ns - recording.start_ns) * 1e-9
+    start_s = job.frame_range.start_s
+    if recording.end_ns and start_s is not None and start_s > seconds:
+        msg = f"{job.source}: --start {start_s:g} is after the end at {seconds:.1f} s"
+        raise NoStreamError(msg)
 
 
 def require_other_folder(job: Job) -> None:

@@ -14,7 +14,7 @@ from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables.reading import PROCESS_AGAIN
 from shapecat.system.files import replacing
 
-__all__ = ["forget_old_labels", "keep_labels", "require_labels"]
+__all__ = ["forget_old_labels", "keep_labels", "keep_last_labels", "require_labels"]
 
 _OTHER = f"the recording is another one; `annotate --by-place --labels {PREVIOUS}` transfers labels"
 
@@ -84,6 +84,23 @@ def forget_old_labels(folder: Path, run: RunInfo, job: Job) -> None:
         run["seconds"].pop(phase, None)
     write_run(folder, run)
     previous.unlink(missing_ok=True)
+
+
+def keep_last_labels(folder: Path, run: RunInfo, job: Job) -> None:
+    """Transfer labels that the replaced results have been given since `keep_labels`, if any.
+
+    They are written to tracks.csv alone, as those that a report page writes.
+
+    Raises
+    ------
+    OutputError : as for `keep_labels`.
+    """
+    seconds = run["seconds"].get("labels", 0.0)
+    forget_old_labels(folder, run, job)
+    if "labels" not in run["seconds"]:
+        keep_labels(folder, run, job)
+        run["seconds"]["labels"] = seconds
+        write_run(folder, run)
 
 
 def _labelled_table(job: Job) -> bytes:
