@@ -128,6 +128,11 @@ def test_damaged_table_of_shapecat_is_refused(run: Path) -> None:
         ("box.", "; the last is a letter, a digit, _ or )"),
         ("merge", "is not a category"),
         ("del", "is not a category"),
+        ("marge with 2", "did you mean merge with 2?"),
+        ("merge_with_2", "did you mean merge with 2?"),
+        ("mergewith 2", "did you mean merge with 2?"),
+        ("\uff42\uff4f\uff57\uff4c", "did you mean bowl?"),  # full-width letters
+        ("\uff44elete", "did you mean delete?"),
         (".", "is not a category"),
         ("x" * 61, "is not a category"),
     ],
@@ -363,7 +368,7 @@ def test_table_needs_no_confidence(run: Path) -> None:
 
 def test_notes_in_columns_without_a_name_are_kept(run: Path) -> None:
     """Only the last of several such columns was written again."""
-    names = f"{HEADER.strip()},,,label"
+    names = f"{HEADER.strip()},,,topic"
     lines = [f"{line},dusty,left shelf,can" for line in labelled(t4="bowl").splitlines()[1:]]
     (run / "tracks.csv").write_text("\n".join([names, *lines]))
     adopt_labels(run / "tracks.csv", run)
@@ -372,6 +377,16 @@ def test_notes_in_columns_without_a_name_are_kept(run: Path) -> None:
     assert saved[1] == "4,0.000,unknown,0.500,bowl,/depth,dusty,left shelf,can"
     adopt_labels(run / "tracks.csv", run)
     assert (run / "tracks.csv").read_text().splitlines() == saved
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_table_with_two_columns_of_labels_is_refused(run: Path, *, own: bool) -> None:
+    """Only one would be read: the labels that a second person added beside it would be lost."""
+    corrected = (run if own else run.parent) / "tracks.csv"
+    corrected.write_text(labelled(t4="bowl").replace("topic\n", "topic,Label\n"))
+
+    with pytest.raises(OutputError, match="several columns label; keep one"):
+        adopt_labels(corrected, run)
 
 
 @pytest.mark.parametrize("label", ["none", "new None", "DontCare", "NA", "new nan", "Null"])

@@ -752,6 +752,13 @@ def test_focus_leaves_text_field_before_next_key(browser: Browser, reported_run:
 
 
 LABELS = (
+    *(
+        "marge with {b}",
+        "merge_with_{b}",
+        "mergewith {b}",
+        "new marge with 2",
+        "\uff43\uff55\uff50",
+    ),
     *("cup", "CUP", "boxx", "new boxx", "cups", "cpu", "pan", "New  pot", "bowling ball", "botle"),
     *(
         "wine glass",

@@ -35,7 +35,9 @@ function misread(label, names) {
     return "A name begins with a letter, ends with a letter, a digit, _ or ), and has at most 60 letters, digits, spaces and - _ . + & ' ( )";
   }
   const allowed = (other) => (Math.min(name.length, other.length) < 5 ? 1 : 2);
-  const near = !NEW.test(label) && [...names, "delete"].find((other) => slips(name, other) <= allowed(other));
+  const plain = name.normalize("NFKC"); // full-width letters look like the others
+  const number = plain.match(/\d{1,9}$/), commands = ["delete", ...(number ? [`merge with ${Number(number)}`] : [])];
+  const near = !NEW.test(label) && [...names, ...commands].find((other) => slips(plain, other) <= allowed(other));
   if (near) return `Did you mean ${near}? For a new category write: new ${label}`;
   names.add(name);
   return "";

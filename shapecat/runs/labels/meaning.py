@@ -195,7 +195,10 @@ def _understand(label: str, names: dict[str, str]) -> _Verdict:
         shown = label if len(label) <= _SHOWN else f"{label[:_SHOWN]}…"
         msg = f"{shown!r} is not a category, `{DELETE}` or `merge with N`{hint}"
         raise ValueError(msg)
-    nearest = None if new else _nearest(name.lower(), [*names, DELETE])
+    number = re.search(r"\d{1,9}$", name)
+    commands = (DELETE, *([merging_with(int(number[0]))] if number else ()))
+    plain = unicodedata.normalize("NFKC", name).lower()  # full-width letters look like the others
+    nearest = None if new else _nearest(plain, [*names, *commands])
     if nearest:
         suggestion = names.get(nearest, nearest)
         msg = f"{label!r}: did you mean {suggestion}? For a new category write `new {name}`"

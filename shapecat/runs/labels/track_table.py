@@ -155,9 +155,12 @@ def _header(path: Path, cells: Sequence[str]) -> tuple[str, ...]:
 
     Raises
     ------
-    OutputError : a column that a tracks.csv needs is missing.
+    OutputError : a column that a tracks.csv needs is missing, or is there twice.
     """
     header = [cell.strip().lower() for cell in cells]
+    if twice := [name for name in _COLUMNS if header.count(name) > 1]:
+        msg = f"{path}: several columns {', '.join(twice)}; keep one, or rename the others"
+        raise OutputError(msg)
     names = tuple(
         n if n not in header[:k] else f"{n} {k + 1}".strip() for k, n in enumerate(header)
     )
