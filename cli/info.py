@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from shapecat.errors import ShapecatError, common_exit_code
+from shapecat.errors import ShapecatError, common_exit_code, printable
 from shapecat.outputs.counts import size_words
 
 from .options import ANY_PATH, array_option
@@ -60,4 +60,4 @@ def _show(overview: dict[str, Any]) -> None:
     rows = [(t["name"], t["type"], t["encoding"], t["count"], t["use"]) for t in overview["topics"]]
     print_table(("topic", "type", "encoding", "messages", "use"), rows)
     for warning in overview["warnings"]:
-        click.echo(f"Warning: {warning}")
+        click.echo(printable(f"Warning: {warning}"))

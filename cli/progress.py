@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import click
 
-from shapecat.errors import listed
+from shapecat.errors import listed, printable
 from shapecat.outputs.counts import plural, size_words
 from shapecat.system.progress import COMPILE, WAIT_FOR_KERNELS, kernel_words
 
@@ -150,7 +150,7 @@ class Progress:
 
     def note(self, text: str) -> None:
         """Show a line."""
-        click.echo(text, err=True)
+        click.echo(printable(text), err=True)
 
     def show(self, folder: str) -> None:
         """Show the progress of a recording, in subclasses."""
@@ -284,7 +284,7 @@ class LiveProgress(Progress):
 
     def note(self, text: str) -> None:
         """Show a line above the bars."""
-        self._rich.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self._rich.console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
 
     def show(self, folder: str) -> None:
         """Move the bar of a recording, which starts again in each phase."""

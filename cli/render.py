@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from shapecat.errors import printable
 from shapecat.outputs.counts import plural
 from shapecat.system import stopping
 
@@ -88,7 +89,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         numeric = bool(rows) and all(isinstance(row[k], int | float) for row in rows)
         table.add_column(name, justify="right" if numeric else "left", overflow="fold")
     for row in rows:
-        table.add_row(*map(str, row))
+        table.add_row(*(printable(str(cell)) for cell in row))
     width = None if sys.stdout.isatty() else _WIDEST  # Rich would obey FORCE_COLOR
     console = Console(width=width, markup=False, emoji=False)
     with console.capture() as printed:  # Rich would end the process if nobody reads

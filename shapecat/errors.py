@@ -1,5 +1,6 @@
 """Errors shown to the user. Each message names the problem, the place, and what to try."""
 
+import re
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 
@@ -13,7 +14,10 @@ __all__ = [
     "common_exit_code",
     "explained",
     "listed",
+    "printable",
 ]
+
+_CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]")
 
 _MOST_NAMES = 12
 """Largest number of names that `listed` shows."""
@@ -23,6 +27,9 @@ class ShapecatError(Exception):
     """A known problem: shown as one line, without a traceback."""
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        return printable(super().__str__())
 
 
 class RecordingError(ShapecatError):
@@ -73,3 +80,16 @@ def listed(names: Sequence[str]) -> str:
     """Return names as a message shows them: the first ones, and how many more there are."""
     left = len(names) - _MOST_NAMES
     return ", ".join(names[:_MOST_NAMES]) + (f" and {left} more" if left > 0 else "")
+
+
+def printable(text: str) -> str:
+    r"""Escape the control characters of a text, except line ends.
+
+    Names in a recording may hold sequences that change or clear the terminal.
+
+    Examples
+    --------
+    >>> printable("/depth\x1b[2J")
+    '/depth\\x1b[2J'
+    """
+    return _CONTROL.sub(lambda match: repr(match[0])[1:-1], text)

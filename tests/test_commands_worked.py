@@ -16,6 +16,7 @@ import pytest
 from click.testing import Result
 
 from shapecat.batch.ledger import Outcome
+from shapecat.errors import OutputError
 from shapecat.executors import WorkerExecutor
 from shapecat.learning import load_model, save_model
 from shapecat.outputs.counts import count_words
@@ -613,6 +614,23 @@ def test_tables_and_bars_show_names_as_they_are(
     for name in ODD:
         assert f"{name}: finding" in shown
         assert f"note on {name}" in shown
+
+
+@pytest.mark.parametrize("kind", ["rich", "plain"])
+def test_names_cannot_control_the_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """A topic may hold an escape sequence, which clears the screen or fakes what was printed."""
+    monkeypatch.setattr("click._compat.should_strip_ansi", lambda *_: False)  # as a terminal
+    evil, shown = "/depth\x1b]0;gone\x07\x9b2J", r"/depth\x1b]0;gone\x07\x9b2J"
+    RENDER.print_table(("name",), [[evil]])
+    with PROGRESS.open_progress(kind, [task("lab")]) as progress:
+        progress.note(f"Warning: {evil}")
+    printed = capsys.readouterr()
+
+    assert printed.out.split() == ["name", shown]
+    assert f"Warning: {shown}" in printed.err
+    assert str(OutputError(f"no {evil}")) == f"no {shown}"
 
 
 def test_annotate_reports_written_files_and_untransferred_labels(
