@@ -288,6 +288,16 @@ def test_run_json_round_trips_and_is_validated(tmp_path: Path) -> None:
         read_run(tmp_path / "nowhere")
 
 
+def test_unreadable_run_json_is_not_called_missing(tmp_path: Path) -> None:
+    """Users without permission to read it looked for another folder."""
+    (tmp_path / "run.json").mkdir()  # permissions do not bind the administrator
+
+    with pytest.raises(OutputError, match=r"run\.json: cannot be read: Is a directory"):
+        read_run(tmp_path)
+    with pytest.raises(OutputError, match=r"no run\.json there"):
+        read_run(tmp_path / "missing")
+
+
 def test_recording_at_url_is_missing_under_its_url(tmp_path: Path) -> None:
     """The URL lost a slash in the message, which must also name the command for this run."""
     url = "s3://lab/in/a.mcap"

@@ -290,7 +290,10 @@ def read_identity(folder: Path) -> RunIdentity:
 
 def _content_of(folder: Path) -> bytes:
     try:
-        return (folder / "run.json").read_bytes()
-    except OSError as error:
+        with explained(f"{folder}/run.json: cannot be read", OutputError):
+            return (folder / "run.json").read_bytes()
+    except OutputError as error:
+        if not isinstance(error.__cause__, FileNotFoundError | NotADirectoryError):
+            raise
         msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
         raise OutputError(msg) from error
