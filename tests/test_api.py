@@ -526,7 +526,7 @@ def test_table_columns_become_arrays(page_folder: Path) -> None:
         run.posterior(999)
 
 
-def test_name_of_one_column_is_no_list_of_letters(tmp_path: Path) -> None:
+def test_name_of_one_column_is_not_a_list_of_letters(tmp_path: Path) -> None:
     """A name read as a list of letters gives a misleading error about a column `a`."""
     pq.write_table(pa.table({"area_m2": [0.5, 2.0], "plane": [0, 1]}), tmp_path / "t.parquet")
     table = Table(tmp_path / "t.parquet")

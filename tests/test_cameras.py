@@ -104,7 +104,7 @@ def test_image_without_k_uses_p(k: Any) -> None:
     assert not distorted  # D belongs to K
 
 
-def test_identity_is_no_calibration() -> None:
+def test_identity_is_not_a_calibration() -> None:
     """Drivers publish identity matrices for uncalibrated cameras."""
     matrices = {"k": np.eye(3).ravel(), "p": np.eye(3, 4).ravel()}
 

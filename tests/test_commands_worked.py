@@ -582,7 +582,7 @@ def test_workers_of_a_cluster_get_absolute_paths(
 ODD = ("/cam[left]/depth", "k [/night].mcap", "box :car:")
 
 
-def test_pipe_is_no_terminal_with_forced_colours(
+def test_pipe_is_not_a_terminal_with_forced_colours(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """CI servers set FORCE_COLOR: names would be broken into lines, and bars fill the log."""

@@ -1270,7 +1270,7 @@ def test_labels_without_masks_may_end_with_an_empty_frame(run: Path) -> None:
     assert found["objects"]["found"] == found["box_iou"]["n"] == 1
 
 
-def test_kitti_dont_care_regions_are_no_objects(tmp_path: Path) -> None:
+def test_kitti_dont_care_regions_are_not_objects(tmp_path: Path) -> None:
     """Lines as in KITTI's own data, which has neither frames.csv nor spaces in types."""
     (tmp_path / "label_2").mkdir()
     lines = (
@@ -1451,7 +1451,7 @@ def test_errors_are_one_line_with_reason_and_exit_code(
 
 
 @pytest.mark.parametrize("place", [".", "/"])
-def test_folder_without_a_name_is_no_reference(shapecat: Run, run: Path, place: str) -> None:
+def test_folder_without_a_name_is_not_a_reference(shapecat: Run, run: Path, place: str) -> None:
     """A person in a folder of labels that shapecat cannot read gets a reason, no traceback."""
     assert refused(shapecat, run, place)[0] == 3
 
@@ -1588,7 +1588,7 @@ def test_damaged_kitti_labels_are_refused_with_the_file(
     assert str(error.value).startswith(str(tmp_path))
 
 
-def test_label_images_that_end_early_or_are_no_images_are_refused(tmp_path: Path) -> None:
+def test_label_images_that_end_early_or_are_not_images_are_refused(tmp_path: Path) -> None:
     """Frames without their labels would count as frames without objects."""
     images = np.arange(2 * 3 * 5, dtype=np.uint8).reshape(2, 3, 5)
     np.savez(tmp_path / "a.npz", labels=images)

@@ -785,7 +785,7 @@ def test_objects_are_detected_in_fused_cloud_of_two_sides() -> None:
         assert own[:, 1].max() - own[:, 1].min() > 0.07  # both sides
 
 
-def test_hidden_wall_in_fused_cloud_is_no_object() -> None:
+def test_hidden_wall_in_fused_cloud_is_not_an_object() -> None:
     """The limits of size also apply to what the virtual camera does not see."""
     shapes = [table(), box((-0.12, 0, 0), (0.1, 0.1, 0.12)), box((0, 0.3, 0), (0.9, 0.03, 0.25))]
     points = np.concatenate([world_points(shapes, 0, 0), world_points(shapes, 180, 1)])
@@ -818,14 +818,14 @@ def test_objects_are_detected_from_directly_above() -> None:
 
 @pytest.mark.parametrize("yaw", [0.3, 0.8, 1.3])
 @pytest.mark.parametrize("tilt_deg", [30, 60, 80])
-def test_top_of_distant_carton_is_no_table(tilt_deg: float, yaw: float) -> None:
+def test_top_of_distant_carton_is_not_a_table(tilt_deg: float, yaw: float) -> None:
     """At 1.6 m, the side of a box is hardly farther away than the edge of its top."""
     check([table(0.7, 0.5), box((0, 0, 0), (0.3, 0.2, 0.15), yaw=yaw)], [1],
           tilt_deg=tilt_deg, distance=1.6)  # fmt: skip
 
 
 @pytest.mark.parametrize("distance", [0.9, 1.4])
-def test_carton_right_below_the_camera_is_no_table(distance: float) -> None:
+def test_carton_right_below_the_camera_is_not_a_table(distance: float) -> None:
     """Its top is larger than a small table, and hides its sides."""
     check([table(0.7, 0.5), box((0, 0, 0), (0.4, 0.3, 0.25))], [1], tilt_deg=87, distance=distance)
 
@@ -837,7 +837,7 @@ def test_platform_right_below_the_camera_supports_objects() -> None:
 
 
 @pytest.mark.parametrize("tilt_deg", [20, 35, 50])
-def test_wall_behind_a_counter_is_no_table(tilt_deg: float) -> None:
+def test_wall_behind_a_counter_is_not_a_table(tilt_deg: float) -> None:
     """It covers several times as much of the image as the counter."""
     counter = [table(0.9, 0.2), box((0, 0.21, -0.05), (1.8, 0.02, 0.9))]
     objects = [box((-0.2, -0.05, 0), (0.1, 0.1, 0.1)), can(0.05, 0, 0, 0.04, 0.12)]
@@ -883,7 +883,7 @@ def test_tilted_top_face_does_not_replace_the_table() -> None:
     assert [plane.area_m2 > 0.3 for plane in scene.planes] == [True]
 
 
-def test_posts_of_rack_are_no_objects() -> None:
+def test_posts_of_rack_are_not_objects() -> None:
     """Posts extend through the height of a board, unlike a tall box that ends below it."""
     rack = [table(0.4, 0.2), table(0.4, 0.2, 0.32)]
     posts = [box((x, -0.19, 0), (0.03, 0.03, 0.6)) for x in (-0.38, 0.38)]
@@ -915,14 +915,14 @@ def test_object_on_board_at_grazing_angle_is_found(board: float) -> None:
     assert min(overlaps(scene, labels, [2])) > 0.8
 
 
-def test_box_top_at_grazing_angle_is_no_plane() -> None:
+def test_box_top_at_grazing_angle_is_not_a_plane() -> None:
     """Unlike a board at this height, it is small and closed below."""
     shapes = [table(0.6, 0.4), box((0, 0, 0), (0.3, 0.25, 0.46))]
     depth, _ = render(shapes, tilt_deg=20, distance=1.5)
     np.testing.assert_allclose([p.height_m for p in found(frame_of(depth)).planes], [0], atol=0.01)
 
 
-def test_post_above_maximum_height_is_no_object() -> None:
+def test_post_above_maximum_height_is_not_an_object() -> None:
     """Its lower part, which is all that is segmented, stands on the table as an object does."""
     post, tall_box = box((-0.25, 0.1, 0), (0.04, 0.04, 0.9)), box((0.1, 0, 0), (0.1, 0.1, 0.45))
     check([table(0.6, 0.4), post, tall_box], [2], tilt_deg=25, distance=1.5)
@@ -934,14 +934,14 @@ def test_overhang_belongs_to_box_at_table_edge() -> None:
 
 
 @pytest.mark.parametrize(("n", "width", "gap"), [(5, 0.11, 0.05), (6, 0.12, 0.02), (4, 0.2, 0.04)])
-def test_row_of_boxes_is_no_wall(n: int, width: float, gap: float) -> None:
+def test_row_of_boxes_is_not_a_wall(n: int, width: float, gap: float) -> None:
     """Their fronts lie in one upright plane, at least 0.75 m wide, and some are large."""
     pitch = width + gap
     row = [box(((k - (n - 1) / 2) * pitch, 0, 0), (width, 0.08, 0.16)) for k in range(n)]
     check([table(0.6, 0.4), *row], list(range(1, n + 1)), tilt_deg=25, distance=1.2)
 
 
-def test_tops_of_equal_boxes_are_no_plane() -> None:
+def test_tops_of_equal_boxes_are_not_a_plane() -> None:
     """Together they are as large as a table, but there is floor between them."""
     places = [(x, y) for y in (-0.3, -0.1, 0.1, 0.3) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)]
     shapes = [box((x, y, 0), (0.15, 0.15, 0.12)) for x, y in places]
@@ -951,7 +951,7 @@ def test_tops_of_equal_boxes_are_no_plane() -> None:
 
 @pytest.mark.parametrize("width", [0.4, 0.45])
 @pytest.mark.parametrize("y", [0.1, -0.2])
-def test_large_box_before_empty_background_is_no_wall(width: float, y: float) -> None:
+def test_large_box_before_empty_background_is_not_a_wall(width: float, y: float) -> None:
     """Depth ends at its large flat front, although the image does not."""
     large = box((-0.28, y, 0), (width, 0.06, 0.3), 0.15)
     check([table(0.5, 0.35), large], [1], tilt_deg=25, distance=1.6)

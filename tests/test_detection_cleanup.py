@@ -235,7 +235,7 @@ def test_hole_is_filled_with_enclosing_object() -> None:
     assert filled.sum() == hole.sum()
 
 
-def test_gap_between_two_boxes_is_no_hole() -> None:
+def test_gap_between_two_boxes_is_not_a_hole() -> None:
     """Each box has half of the boundary of the gap."""
     inv_depth = np.full((40, 40), 1.25, np.float32)
     labels, filled = np.zeros((40, 40), np.int16), np.zeros((40, 40), np.uint8)
@@ -264,7 +264,7 @@ def test_mouth_of_cup_seen_from_above_is_filled(width: int, torn: int, filled: b
     assert cells.sum() == filled * (width - 2 * torn) ** 2
 
 
-def test_background_of_large_image_is_no_hole() -> None:
+def test_background_of_large_image_is_not_a_hole() -> None:
     """The product of its open sides (six gaps of a rack) and its cells exceeds 32 bits."""
     inv_depth = np.full((632, 632), 0.5, np.float32)
     labels, filled = np.zeros((632, 632), np.int16), np.zeros((632, 632), np.uint8)

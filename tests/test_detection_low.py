@@ -62,7 +62,7 @@ def bump(radius: float, edge: float) -> Array:
 
 
 @pytest.mark.usefixtures("unrejected")
-def test_depth_error_of_table_is_no_object() -> None:
+def test_depth_error_of_table_is_not_an_object() -> None:
     """The depth error is larger than the minimum height of an object."""
     frame = measured(depth_of(0.016 * bump(80, 90)))
     assert len(found(frame).candidates) == 0

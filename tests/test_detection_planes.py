@@ -96,7 +96,7 @@ def test_table_is_found_in_narrow_strips() -> None:
 
 
 @pytest.mark.parametrize("seed", [500006, 520022])
-def test_strips_at_range_limit_are_no_plane(seed: int) -> None:
+def test_strips_at_range_limit_are_not_a_plane(seed: int) -> None:
     """Nothing is visible beyond the limit, as below the edge of a board."""
     assert score("empty", seed, 1)["scenes with all planes"] == 1
 
@@ -120,7 +120,7 @@ def test_floor_of_raised_bin_is_a_plane_unlike_box_top() -> None:
     assert supports([ground, body, *sides]) == pytest.approx([-0.5, 0], abs=0.01)
 
 
-def test_layer_of_boxes_is_no_plane_unlike_low_cupboard() -> None:
+def test_layer_of_boxes_is_not_a_plane_unlike_low_cupboard() -> None:
     """From 1.5 m, gaps of 1 cm are hardly visible; a cupboard without gaps supports objects."""
     ground, cup = block(0, 0, -0.25, (3.0, 3.0, 0.05)), block(0.1, 0.05, 0, (0.06, 0.06, 0.08))
     cupboard, book = block(0, 0, -0.2, (0.8, 0.6, 0.2)), block(0.1, 0.05, 0, (0.15, 0.1, 0.03))
@@ -129,7 +129,7 @@ def test_layer_of_boxes_is_no_plane_unlike_low_cupboard() -> None:
         assert supports([ground, cupboard, thing], 1.5) == pytest.approx([-0.2, 0], abs=0.01)
 
 
-def test_layer_of_boxes_with_another_box_on_it_is_no_plane() -> None:
+def test_layer_of_boxes_with_another_box_on_it_is_not_a_plane() -> None:
     """The camera sees only a few centimetres into the gaps, but below the plane of the tops."""
     ground, upper = block(0, 0, -0.25, (3.0, 3.0, 0.05)), block(0.3, 0.14, 0, (0.28, 0.26, 0.1))
     assert supports([ground, *layer(0.0125), upper], 1.5) == pytest.approx([-0.2], abs=0.01)

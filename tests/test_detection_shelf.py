@@ -29,35 +29,35 @@ def scene_labels(kind: SceneKind, seed: int) -> tuple[NDArray[Any], list[NDArray
 
 
 @pytest.mark.parametrize("seed", [377, 507])
-def test_wall_beyond_the_floor_is_no_object(seed: int) -> None:
+def test_wall_beyond_the_floor_is_not_an_object(seed: int) -> None:
     """Only a corner of a wall at the range limit is above the visible floor."""
     assert scene_labels("empty", seed)[1] == []
 
 
-def test_corner_of_wall_beside_table_is_no_object() -> None:
+def test_corner_of_wall_beside_table_is_not_an_object() -> None:
     """Most of the wall is behind the table, above the maximum height of objects."""
     assert scene_labels("empty", 410029)[1] == []
 
 
 @pytest.mark.parametrize("seed", [370775, 380981])
-def test_wall_in_image_corner_is_no_object(seed: int) -> None:
+def test_wall_in_image_corner_is_not_an_object(seed: int) -> None:
     """Little of it is visible, but the image border cuts it on two sides."""
     assert scene_labels("empty", seed)[1] == []
 
 
 @pytest.mark.parametrize("seed", [313, 581])
-def test_edge_on_side_of_shelf_is_no_object(seed: int) -> None:
+def test_edge_on_side_of_shelf_is_not_an_object(seed: int) -> None:
     """It is too narrow in the image to fit a wall, and cut by a board or the border."""
     assert all(np.median(candidate) >= FIRST_OBJECT for candidate in scene_labels("shelf", seed)[1])
 
 
 @pytest.mark.parametrize("seed", [556, 567])
-def test_front_of_shelf_side_is_no_object(seed: int) -> None:
+def test_front_of_shelf_side_is_not_an_object(seed: int) -> None:
     """The image border cuts it; the side behind it is detected as a wall."""
     assert all(np.median(candidate) >= FIRST_OBJECT for candidate in scene_labels("shelf", seed)[1])
 
 
-def test_speckled_side_of_shelf_is_no_object() -> None:
+def test_speckled_side_of_shelf_is_not_an_object() -> None:
     """Many samples of an edge-on surface are missing, and the rest look less steep."""
     assert all(np.median(candidate) >= FIRST_OBJECT for candidate in scene_labels("shelf", 335)[1])
 
@@ -72,7 +72,7 @@ def test_patch_of_shelf_back_is_not_merged_with_objects(seed: int, label: int) -
 
 
 @pytest.mark.parametrize("seed", [653, 683])
-def test_sliver_beside_shelf_side_is_no_object(seed: int) -> None:
+def test_sliver_beside_shelf_side_is_not_an_object(seed: int) -> None:
     """The noise of an upright side spreads to its base, which seems to rise from the board."""
     assert all(np.median(candidate) >= FIRST_OBJECT for candidate in scene_labels("shelf", seed)[1])
 
@@ -112,7 +112,7 @@ def test_object_is_not_split(seed: int, label: int) -> None:
     ("kind", "seed", "quarters"),
     [("shelf", 9, 2), ("shelf", 35, 2), ("clutter", 111, 2), ("clutter", 624, 1)],
 )
-def test_wall_is_no_supporting_plane_in_rotated_image(
+def test_wall_is_not_a_supporting_plane_in_rotated_image(
     kind: SceneKind, seed: int, quarters: int
 ) -> None:
     """More of the back of a shelf is visible than of its boards, and objects divide a wall."""
@@ -167,7 +167,7 @@ def test_lid_is_merged_with_its_box() -> None:
 
 
 @pytest.mark.parametrize(("seed", "label"), [(739, 20), (786, 25)])
-def test_small_top_of_object_is_no_supporting_plane(seed: int, label: int) -> None:
+def test_small_top_of_object_is_not_a_supporting_plane(seed: int, label: int) -> None:
     """It is as large as the visible part of some floors, but lies above another plane."""
     labels, candidates = scene_labels("shelf", seed)
     most = max(np.count_nonzero(candidate == label) for candidate in candidates)
@@ -189,7 +189,7 @@ def test_floor_strip_beside_table_is_a_plane(seed: int) -> None:
     ("kind", "seed", "quarters"),
     [("clutter", 25, 2), ("shelf", 135, 0), ("shelf", 1374, 2)],
 )
-def test_wall_is_no_table_for_rotated_camera(kind: SceneKind, seed: int, quarters: int) -> None:
+def test_wall_is_not_a_table_for_rotated_camera(kind: SceneKind, seed: int, quarters: int) -> None:
     """More of the wall or of the shelf's back is visible than of the supporting planes."""
     rng = np.random.default_rng(seed)
     world = make_scene(kind, rng, frames=1)

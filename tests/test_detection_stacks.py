@@ -69,13 +69,13 @@ def overlap_in_clutter(seed: int, labels: list[int]) -> float:
     return min(overlaps(found(frame), truth, labels))
 
 
-def test_ball_touching_a_box_is_no_handle() -> None:
+def test_ball_touching_a_box_is_not_a_handle() -> None:
     """The ball's contact with the table is hidden, but handles are not spherical."""
     assert overlap_in_clutter(690, [27]) > 0.8
 
 
 @pytest.mark.parametrize(("seed", "label"), [(430, 20), another(2, 25), another(39, 30)])
-def test_neighbour_with_hidden_base_is_no_handle(seed: int, label: int) -> None:
+def test_neighbour_with_hidden_base_is_not_a_handle(seed: int, label: int) -> None:
     """Little of its base is visible, but its border with the other object is short."""
     assert overlap_in_clutter(seed, [label]) > 0.8
 
@@ -92,13 +92,13 @@ def test_object_leaning_over_another_is_separated(seed: int, labels: list[int]) 
     assert overlap_in_clutter(seed, labels) > 0.8
 
 
-def test_bowl_is_no_neck_of_can_below() -> None:
+def test_bowl_is_not_a_neck_of_can_below() -> None:
     """It is as wide as the can and hides its top, but there is a step between their sides."""
     assert overlap_in_clutter(464, [20, 27]) > 0.8
 
 
 @pytest.mark.parametrize(("seed", "label"), [(703, 23), (938, 20)])
-def test_tall_box_is_no_side_of_shelf(seed: int, label: int) -> None:
+def test_tall_box_is_not_a_side_of_shelf(seed: int, label: int) -> None:
     """Its faces are at a grazing angle, too, but some of its top is visible."""
     assert overlap_in_clutter(seed, [label]) > 0.8
 
@@ -271,7 +271,7 @@ def test_stack_without_edge_is_split_in_clutter(seed: int, label: int) -> None:
     assert overlap_in_clutter(seed, [label]) > 0.75
 
 
-def test_outline_cut_by_occluder_is_no_width_change() -> None:
+def test_outline_cut_by_occluder_is_not_a_width_change() -> None:
     """The lower half of a box is hidden on one side."""
     shapes = [
         table(),

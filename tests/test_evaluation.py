@@ -838,7 +838,7 @@ def test_training_views_of_cross_validation_are_mean_over_folds(
     assert [row.learned for row in rows] == [round(235 * 3 / 4), round(227 * 3 / 4)]
 
 
-def test_few_unknown_shapes_are_no_problem_for_cross_validation() -> None:
+def test_few_unknown_shapes_are_not_a_problem_for_cross_validation() -> None:
     """scikit-learn printed a warning that there are too few of them for all folds."""
     labels, nothing = np.array([*["cup", "can"] * 3, "unknown"]), np.zeros(7)
     objects = np.arange(7).astype(str)

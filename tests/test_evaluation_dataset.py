@@ -228,7 +228,7 @@ def test_category_without_folders_of_objects_is_refused(tmp_path: Path, name: st
     assert read_dataset(tmp_path).files == (tmp_path / "cup" / "a" / "0.pcd",)
 
 
-def test_hidden_files_are_no_views(tmp_path: Path) -> None:
+def test_hidden_files_are_not_views(tmp_path: Path) -> None:
     """Notebooks and macOS leave hidden files, but the data set itself may be in a hidden folder."""
     root = tmp_path / ".cache" / "data"
     for name in ("cup/a/0.pcd", "cup/a/._0.pcd", "cup/.ipynb_checkpoints/0.pcd", ".Trash/b/0.pcd"):

@@ -71,7 +71,7 @@ def test_edit_of_callee_recompiles_the_caller(stage: Path, run: Run, decorator: 
     assert len([*stage.glob("__pycache__/kernels-*")]) == 1, "code of earlier files is left"
 
 
-def test_folder_that_another_process_removes_is_no_error(
+def test_folder_that_another_process_removes_is_not_an_error(
     stage: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After an update, several processes that start at once remove the old kernels."""

@@ -83,7 +83,7 @@ def test_copy_with_other_file_times_is_same_recording(
     assert "already complete" in result.stdout
 
 
-def test_new_file_beside_parts_of_bag_is_no_change(shapecat: Run, tmp_path: Path) -> None:
+def test_new_file_beside_parts_of_bag_is_not_a_change(shapecat: Run, tmp_path: Path) -> None:
     """A note or a thumbnail would keep corrected labels from being applied."""
     lab = record(tmp_path / "lab", 12, container="ros2")
     command = ("process", lab, "--out", tmp_path / "out", *OPTIONS)

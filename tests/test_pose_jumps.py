@@ -85,7 +85,7 @@ def test_time_of_jump_counts_from_first_frame_of_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [1, 5, 30])
-def test_motion_of_a_robot_is_no_jump(tmp_path: Path, rate_hz: float) -> None:
+def test_motion_of_a_robot_is_not_a_jump(tmp_path: Path, rate_hz: float) -> None:
     """A robot may start, stop and turn its head between two frames."""
     places = driven(60, rate_hz)
     yaws = np.sin(np.arange(60) / rate_hz)
@@ -94,7 +94,7 @@ def test_motion_of_a_robot_is_no_jump(tmp_path: Path, rate_hz: float) -> None:
     assert list(explain_jumps(tmp_path, "map")) == []
 
 
-def test_motion_during_a_gap_is_no_jump(tmp_path: Path) -> None:
+def test_motion_during_a_gap_is_not_a_jump(tmp_path: Path) -> None:
     """A recorder that drops frames, or is paused, misses the motion."""
     places, yaws = driven(60, 30), np.full(60, 0.4)
     kept = np.r_[0:20, 45:60]

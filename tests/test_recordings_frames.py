@@ -75,7 +75,7 @@ def test_end_may_be_far_after_the_end(tmp_path: Path, container: str, end_s: flo
     assert not read(path, start_s=end_s)[0]
 
 
-def test_messages_of_another_type_on_the_topic_are_no_frames(tmp_path: Path) -> None:
+def test_messages_of_another_type_on_the_topic_are_not_frames(tmp_path: Path) -> None:
     """Two nodes may publish on one topic; other messages must not change the frame numbers."""
     items = []
     for k in range(3):

@@ -494,7 +494,7 @@ def test_change_of_smallest_object_size_is_noticed() -> None:
         assert not shows_the_same(frame, None, other, None, range_m=2.0)
 
 
-def test_single_pixels_and_distant_surfaces_are_no_change() -> None:
+def test_single_pixels_and_distant_surfaces_are_not_a_change() -> None:
     frame = blank()
     assert frame.depth is not None
     depth = frame.depth.copy()

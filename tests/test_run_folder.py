@@ -432,7 +432,7 @@ def test_failing_disk_is_an_error_but_a_disk_without_flush_is_not(
     assert (tmp_path / "f").exists() is not raised
 
 
-def test_remains_of_a_killed_process_are_no_part_of_a_folder(tmp_path: Path) -> None:
+def test_remains_of_a_killed_process_are_not_part_of_a_folder(tmp_path: Path) -> None:
     """A run that was killed while it wrote a segment could not be resumed."""
     folder = tmp_path / "0001"
     partial_path(folder).mkdir()

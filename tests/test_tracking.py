@@ -171,7 +171,7 @@ def cameras(count: int, *, frames: int, apart: float) -> list[FrameDetections]:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_cameras_that_see_different_objects_are_no_scene_cuts(count: int) -> None:
+def test_cameras_that_see_different_objects_are_not_scene_cuts(count: int) -> None:
     """If cameras take turns, consecutive frames show different objects without a scene cut."""
     frames = cameras(count, frames=30, apart=0.15)
     together = {frame.topic for frame in frames}
@@ -209,7 +209,7 @@ def test_false_detection_gets_no_track() -> None:
     assert track.hits == 20
 
 
-def test_one_bad_frame_is_no_scene_cut() -> None:
+def test_one_bad_frame_is_not_a_scene_cut() -> None:
     """One frame with all objects missed and two false ones must not break the tracks."""
     places = [[0, 0, 0], [0.3, 0, 0]]
     frames = [frame(k, [[0.1, 0.1, 0], [0.2, 0.1, 0]] if k == 9 else places) for k in range(20)]
@@ -217,7 +217,7 @@ def test_one_bad_frame_is_no_scene_cut() -> None:
     assert [track.hits for track in track_frames(frames, SETTINGS)] == [19, 19]
 
 
-def test_one_of_two_objects_moved_is_no_scene_cut() -> None:
+def test_one_of_two_objects_moved_is_not_a_scene_cut() -> None:
     """At one image per second, the object that stayed would get a new track."""
     places = [[[0, 0, 0], [0.4, 0, 0]]] * 5 + [[[0, 0, 0], [0.4, 0.2, 0]]] * 5
     frames = [frame(k, both, stamp_ns=k * SECOND) for k, both in enumerate(places)]
@@ -226,7 +226,7 @@ def test_one_of_two_objects_moved_is_no_scene_cut() -> None:
 
 
 @pytest.mark.parametrize("step_m", [0.06, 0.09])
-def test_objects_that_move_together_are_no_scene_cut(step_m: float) -> None:
+def test_objects_that_move_together_are_not_a_scene_cut(step_m: float) -> None:
     """On a belt, at two images per second, each object would get a new track in each image."""
     random = np.random.default_rng(6)
     frames = []
@@ -642,7 +642,7 @@ def test_backward_clock_jump_is_scene_cut() -> None:
     assert [track.hits for track in track_frames(frames, SETTINGS)] == [5, 5]
 
 
-def test_late_message_is_no_scene_cut() -> None:
+def test_late_message_is_not_a_scene_cut() -> None:
     """A message that arrives after a newer one must not end the tracks of all objects."""
     stamps = [*range(20), 21, 20, *range(22, 40)]
     frames = [frame(k, [0, 0, 0], stamp_ns=s * SECOND // 10) for k, s in enumerate(stamps)]
@@ -694,7 +694,7 @@ def test_two_sensors_share_tracks_despite_clock_jump(single: bool) -> None:
 
 
 @pytest.mark.parametrize("per_s", [10, 2])
-def test_scraps_at_image_border_are_no_scene_cut(per_s: int) -> None:
+def test_scraps_at_image_border_are_not_a_scene_cut(per_s: int) -> None:
     """When a camera pans away or back, only an edge of the last or first object is visible."""
     whole, scrap = (0.08, 0.07, 0.07), (0.04, 0.02, 0.07)
     sizes = [whole] * 10 + [scrap] + [None] * 20 + [scrap] + [whole] * 10
@@ -710,7 +710,7 @@ def test_scraps_at_image_border_are_no_scene_cut(per_s: int) -> None:
     assert [track.hits for track in track_frames(frames, SETTINGS)] == [22]
 
 
-def test_slow_views_past_an_occluder_are_no_scene_cut() -> None:
+def test_slow_views_past_an_occluder_are_not_a_scene_cut() -> None:
     """A camera that moves on between two frames may see only parts of all objects."""
     places = np.arange(3)[:, None] * [0.4, 0, 0]
     whole = [frame(k, places, stamp_ns=k * SECOND) for k in range(3)]
