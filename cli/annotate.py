@@ -59,6 +59,8 @@ def annotate(
     click.echo(f"{run}: wrote {' and '.join(written) or 'only its tables'}")
     if changes := changed_labels(before, _labels_of(run)):
         click.echo(f"{run}: {changes}")
+        if (run / "report.html").exists():
+            click.echo(f"report.html shows the earlier labels; renew it: shapecat report {run}")
     if transfer is not None:
         _show(transfer.as_dict(), labels)
     _warn_of_far_merges(run)

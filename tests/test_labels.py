@@ -492,6 +492,22 @@ def test_labels_of_someone_else_are_not_silently_replaced(
     assert done.output.splitlines()[-1] == told
 
 
+def test_annotate_says_that_report_page_is_old(
+    shapecat: Callable[..., Result], guessed_run: Path, tmp_path: Path
+) -> None:
+    """Whoever opens the page would take the labels that were replaced for the final ones."""
+    folder = tmp_path / "table"
+    shutil.copytree(guessed_run, folder)
+    (folder / "report.html").touch()
+    row = read_track_table(folder / "tracks.csv").rows[0]
+    table = tmp_path / "mine.csv"
+    table.write_text(f"track,category,confidence,label\n{row.track},{row.category},0.5,vase\n")
+    first, again = (shapecat("annotate", folder, "--labels", table) for _ in range(2))
+
+    assert f"renew it: shapecat report {folder}" in first.output
+    assert "renew it" not in again.output  # the same labels
+
+
 def test_missing_lines_keep_their_label(run: Path) -> None:
     """A filtered spreadsheet must not delete the labels of hidden lines."""
     corrected = run.parent / "mine.csv"
