@@ -18,8 +18,8 @@ from shapecat.recordings.colour_streams import pair_colours
 from shapecat.rehearsal import compile_all
 from shapecat.runs.folder import (
     OUTPUT_OPTIONS,
-    OUTPUTS,
     made_by_run,
+    outputs_pending,
     read_run,
     recover,
     staged,
@@ -305,13 +305,12 @@ def annotate_again(
     from shapecat.runs.finished import open_source  # noqa: PLC0415  on first use
 
     with open_source(read_run(folder), recording) as source, writing_outputs(folder):
-        transfer = _apply_labels(labels, folder, by_place=by_place)
+        with outputs_pending(folder):
+            transfer = _apply_labels(labels, folder, by_place=by_place)
         run = read_run(folder)
         run["input"] |= {"path": str(source.path.resolve()), "files": file_stats(source.path)}
         run |= {"boxes": boxes} if boxes else {}
-        for output in OUTPUTS:
-            run["seconds"].pop(output, None)
-        write_run(folder, run)  # so that, after a kill, the next run writes the missing outputs
+        write_run(folder, run)
         annotate(folder, source, run, observe)
         write_run(folder, run)
     return transfer

@@ -373,6 +373,38 @@ def test_outputs_of_killed_annotation_are_completed_with_its_options(
     assert labels(job.folder) == {"vase"}
 
 
+def test_kill_right_after_new_labels_leaves_outputs_to_be_written(
+    job: Job, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise the next command would call them complete, although they have the old labels."""
+    give_label(job.folder, "vase")
+    real = pipeline._apply_labels
+
+    def apply(*arguments: Any, **options: Any) -> None:
+        real(*arguments, **options)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(pipeline, "_apply_labels", apply)
+        pipeline.annotate_again(job.folder, None)
+    assert not {"review.rrd", "annotated.mcap"} & read_run(job.folder)["seconds"].keys()
+
+    pipeline.process(replace(job, overwrite=False))
+
+    assert {"review.rrd", "annotated.mcap"} <= read_run(job.folder)["seconds"].keys()
+
+
+def test_refused_labels_leave_the_run_complete(job: Job, tmp_path: Path) -> None:
+    """A typo would have the next command write the outputs, for hours in a long recording."""
+    before = read_run(job.folder)
+    wrong = tmp_path / "wrong.csv"
+    wrong.write_text("track,category,confidence,label\n999,cup,0.5,vase\n")
+    with pytest.raises(OutputError):
+        pipeline.annotate_again(job.folder, wrong)
+
+    assert read_run(job.folder) == before
+
+
 def test_segments_are_in_the_order_of_the_recording_on_any_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,7 +12,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Literal
 
-from shapecat.errors import OutputError, explained
+from shapecat.errors import OutputError, ShapecatError, explained
 from shapecat.runs.run_info import RunIdentity, RunInfo, parse_identity, parse_run
 from shapecat.system.files import BusyError, flush, holding, partial_path, replacing, require_utf8
 
@@ -23,6 +23,7 @@ __all__ = [
     "Marker",
     "clear",
     "made_by_run",
+    "outputs_pending",
     "previous_path",
     "read_identity",
     "read_run",
@@ -245,6 +246,23 @@ def writing_outputs(folder: Path) -> Iterator[None]:
     except BusyError as error:
         msg = f"{folder}: another command is writing its outputs; wait for it and run this again"
         raise OutputError(msg) from error
+
+
+@contextmanager
+def outputs_pending(folder: Path) -> Iterator[None]:
+    """Mark the outputs of a finished run as missing; after a kill, the next run writes them.
+
+    After a `ShapecatError` in the block, which then has changed nothing, they count as written.
+    """
+    before, run = read_run(folder), read_run(folder)
+    for output in OUTPUTS:
+        run["seconds"].pop(output, None)
+    write_run(folder, run)
+    try:
+        yield
+    except ShapecatError:
+        write_run(folder, before)
+        raise
 
 
 def _discard(hidden: Path, created: list[Path]) -> None:
