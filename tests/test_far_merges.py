@@ -51,8 +51,9 @@ def test_annotate_warns_of_merged_objects_in_different_places(
     run: Path, shapecat: Shapecat
 ) -> None:
     """A typo in a number silently joined two objects in one box, over half of the table."""
-    gaps = {pair: np.mean(values) for pair, values in true_gaps(run).items()}
-    counts = {pair: len(values) for pair, values in true_gaps(run).items()}
+    distances = true_gaps(run)
+    gaps = {pair: np.mean(values) for pair, values in distances.items()}
+    counts = {pair: len(values) for pair, values in distances.items()}
     a, b = max(gaps, key=lambda pair: gaps[pair])
     assert gaps[a, b] > 0.2
 
