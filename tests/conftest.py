@@ -228,7 +228,7 @@ def run(guessed_run: Path, tmp_path: Path) -> Path:
 def drawn(guessed_run: Path) -> Any:
     """Return the `RunReport` of `guessed_run`, whose pictures are drawn once for all tests.
 
-    The page shows the labels of the run in ``folder``; `replace` it to show those of a copy.
+    The page shows the labels in its ``folder``; `replace` that to show the labels of a copy.
     """
     from shapecat.outputs.report.writing import read_report
 

@@ -34,7 +34,7 @@ FIXTURES = Path(__file__).parents[1] / "fixtures"
 EXPECTED = FIXTURES / "expected"
 RATE_HZ = 10.0
 TOLERANCE = 0.002
-"""Largest accepted difference of metres and probabilities: machines differ in how they round."""
+"""Largest accepted difference, absolute or relative: machines differ in how they round."""
 DETECTIONS = (
     "frame",
     "detection",

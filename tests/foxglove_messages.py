@@ -16,7 +16,7 @@ DOUBLE, STRING, MESSAGE, RAW, ENUM, FIXED, INT64 = 1, 9, 11, 12, 14, 7, 3
 
 
 class Field(NamedTuple):
-    """A field; ``kind`` is numbered as in descriptor.proto, ``message`` the name of its message."""
+    """A field; ``kind`` is its type, as in descriptor.proto, ``message`` the type of a message."""
 
     name: str
     kind: int
@@ -118,13 +118,13 @@ def _class_of(name: str) -> Any:
 
 
 def time(stamp: int, encoding: str) -> dict[str, int]:
-    """Return a stamp in nanoseconds as an encoding, ``protobuf`` or ``json``, writes it."""
+    """Return the fields of a stamp in nanoseconds; ``encoding`` is ``protobuf`` or ``json``."""
     names = ("seconds", "nanos") if encoding == "protobuf" else ("sec", "nsec")
     return dict(zip(names, divmod(stamp, SECOND), strict=True))
 
 
 def content(data: bytes, encoding: str) -> Any:
-    """Return bytes as an encoding writes them."""
+    """Return the value of a field of bytes: in JSON, base64 text."""
     return data if encoding == "protobuf" else base64.b64encode(data).decode()
 
 

@@ -17,7 +17,7 @@ __all__ = ["FrameDetections", "frame", "gather", "track_frames"]
 class FrameDetections(Record):
     """The detections (n,) of one frame, which may have none; columns are as in `DetectionTable`.
 
-    There, ``detections`` are ``numbers``. If ``described`` is None, no description was copied.
+    There, ``detections`` are ``numbers``. If ``described`` is None, this frame described all.
     """
 
     topic: str

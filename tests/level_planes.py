@@ -15,5 +15,5 @@ RAY_HEIGHTS = ((J - 159.5) * UP[0] + (I - 119.5) * UP[1]) / 262.5 + UP[2]
 
 
 def level(below_m: float = 0.7) -> F4:
-    """Return the inverse depth (240, 320) of a level plane at a given depth below the camera."""
+    """Return the inverse depth (240, 320) of a level plane, ``below_m`` lower than the camera."""
     return np.asarray(RAY_HEIGHTS / -below_m, np.float32)

@@ -6,7 +6,7 @@ from collections.abc import Set as AbstractSet
 
 
 def loaded_by(code: str, libraries: AbstractSet[str]) -> set[str]:
-    """Return which of some modules are loaded after running ``code``."""
+    """Return which of ``libraries`` are loaded after running ``code``."""
     names = ",".join(sorted(libraries))
     report = f"import sys; print(*set({names!r}.split(',')) & set(sys.modules))"
     done = subprocess.run(

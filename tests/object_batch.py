@@ -30,8 +30,9 @@ FRAMES = 3
 class Report:
     """The outcome of a batch.
 
-    ``made`` counts how often each recording became a run; ``left`` names the objects in the bucket
-    that belong to neither runs nor manifest; ``refused`` counts refused requests.
+    ``states`` and ``tries`` count recordings by state and by number of tries, ``made`` how often
+    each recording became a run; ``left`` names the objects in the bucket that belong to neither
+    runs nor manifest; ``refused`` counts refused requests.
     """
 
     code: int

@@ -41,7 +41,7 @@ def examine(path: Path, out: Path, *options: str) -> Verdict:
 
 
 def recordings(folder: Path) -> Iterator[Path]:
-    """Yield the files of a folder, and the folders that are one recording."""
+    """Yield the files in a folder and its subfolders, and the folders that are one recording."""
     for path in sorted(folder.iterdir()):
         parts = (
             [p for p in path.iterdir() if p.suffix in {".db3", ".zstd"}] if path.is_dir() else []

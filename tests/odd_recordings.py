@@ -111,7 +111,7 @@ def folder(
 
 
 def database(path: Path, *, definitions: bool) -> Path:
-    """Write the database of a ROS 2 folder, without its folder's metadata."""
+    """Write a ROS 2 folder; return its database, with or without message ``definitions``."""
     file = folder(path, StoragePlugin.SQLITE3) / "a.db3"
     if not definitions:
         connection = sqlite3.connect(file)
@@ -153,13 +153,13 @@ def plain(path: Path, items: Any) -> Path:
 
 
 def changed(path: Path, change: Callable[[str, Any], Any], *, clouds: bool = False) -> Path:
-    """Write the table with changed messages."""
+    """Write the table with each message replaced by ``change(topic, message)``."""
     items = ((t, time, change(t, m)) for t, time, m in stream(FACTORY, FRAMES, clouds=clouds))
     return plain(path, items)
 
 
 def compressed_depth(path: Path, pack: Callable[[Any], bytes]) -> Path:
-    """Write two frames of the table with compressed depth images."""
+    """Write two frames of the table with depth images compressed by ``pack``."""
 
     def change(topic: str, message: Any) -> Any:
         if not topic.endswith("image_raw"):
@@ -189,7 +189,7 @@ def realsense(path: Path) -> Path:
 
 
 def layout(kind: str) -> Callable[[Path], Path]:
-    """Return a writer of clouds with another layout of a point."""
+    """Return a writer of clouds with another layout of a point, by its name in `CASES`."""
     order = ">" if kind == "big-endian" else "<"
     step = {"padded": 32, "unaligned": 15, "f8": 24, "extra": 20}.get(kind, 12)
     offset = {"unaligned": 3, "extra": 4}.get(kind, 0)

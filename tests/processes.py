@@ -59,7 +59,7 @@ def obey_interrupts() -> None:
 
 
 def obey_interrupts_at_low_priority() -> None:
-    """Obey interrupts, and run slower than the sender, so that the command does not end first."""
+    """Obey interrupts, at a low priority, so that the command does not end before the signal."""
     obey_interrupts()
     os.nice(10)
 

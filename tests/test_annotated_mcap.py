@@ -381,7 +381,7 @@ def test_messages_of_ros2_folder_stay_byte_for_byte(tmp_path: Path, plugin: Stor
 
     summary = summary_of(target)
     (channel,) = (one for one in summary.channels.values() if one.topic == "/points")
-    # Without it, subscribers would not receive the played messages.
+    # Without this profile, subscribers would not receive the played messages.
     assert parse_qos(channel.metadata["offered_qos_profiles"]) == [QOS]
     with AnyReader([target]) as reader:
         chosen = [c for c in reader.connections if c.topic == "/points"]
@@ -439,7 +439,7 @@ def test_ros1_bag_is_converted_to_ros2(tmp_path: Path) -> None:
 
 
 def test_ros1_type_that_ros2_has_extended_keeps_its_definition(tmp_path: Path) -> None:
-    """Markers have more fields in ROS 2: with that definition, a recorded one ends too early.
+    """Markers have more fields in ROS 2: read by its definition, a ROS 1 marker ends too early.
 
     A MarkerArray has the same fields in both, but contains markers.
     """

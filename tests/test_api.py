@@ -47,7 +47,7 @@ def blocks(kind: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def page_folder(shapecat: Callable[..., Result], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run every block of the page, in order, in an empty folder, as one script."""
+    """Run the page in an empty folder: its commands, then its Python blocks as one script."""
     folder = tmp_path_factory.mktemp("python")
     (folder / "page.py").write_text("\n".join(blocks("python")), "utf-8")
     with pytest.MonkeyPatch.context() as patch:
@@ -226,7 +226,7 @@ def test_perceived_frame_has_all_that_was_found(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_frame_of_recording_is_perceived_as_it_is(image: Any) -> None:
-    """Without its intrinsics or its stamp, a frame would give other objects, or none to match."""
+    """Other intrinsics would give other objects; without a stamp, their time would be lost."""
     of_frame = shapecat.perceive(image)
     of_depth = shapecat.perceive(image.depth, image.camera)
 
@@ -371,7 +371,7 @@ def test_camera_matrix_and_camera_equal_four_numbers() -> None:
 
 
 def test_crop_of_image_is_perceived() -> None:
-    """The centre of a cropped camera may be outside of the image."""
+    """The principal point of a cropped image may be outside of it."""
     camera = shapecat.perceive(np.zeros((48, 64)), (61, 62, -10.5, 50)).reading.camera
     assert camera == Camera(64, 48, 61, 62, -10.5, 50)
 
@@ -415,7 +415,7 @@ def test_merged_tracks_are_described_as_one(guessed_run: Path, tmp_path: Path) -
 
 
 def test_frames_of_one_topic_are_read(page_folder: Path) -> None:
-    """A single name is one topic, as for `process`, and no list of letters."""
+    """A single name is one topic, as for `process`, not a list of letters."""
     with shapecat.open_recording(page_folder / "demo.mcap") as recording:
         frame = next(iter(recording.frames("/camera/depth/image_raw")))
 
@@ -425,7 +425,7 @@ def test_frames_of_one_topic_are_read(page_folder: Path) -> None:
 @pytest.mark.parametrize("container", ["mcap", "ros1", "ros2"])
 @pytest.mark.parametrize("read", [0, 1])
 def test_frames_of_closed_recording_are_refused(tmp_path: Path, container: str, read: int) -> None:
-    """In a ROS 2 bag, the frames would end as if there were no more; elsewhere, in a traceback."""
+    """A ROS 2 bag would seem to have no more frames; other formats would give a traceback."""
     path = record(tmp_path / "a", 5, container=container)
     with shapecat.open_recording(path) as recording:
         frames = recording.frames()
@@ -579,7 +579,7 @@ def test_arrays_of_run_without_objects_join_those_of_others(
 
 
 def test_lists_of_different_lengths_keep_their_type(tmp_path: Path) -> None:
-    """As floats, the empty list of an object without edges could not index its neurons."""
+    """If an empty list of edges became floats, it could not index the neurons."""
     edges = pa.array([[0, 1, 1, 2], [], [0, 3]], pa.list_(pa.uint16()))
     neurons = pa.array([[0.5, 1.5, 2.5], [], [3.5]], pa.list_(pa.float32()))
     pq.write_table(pa.table({"edges": edges, "neurons": neurons}), tmp_path / "t.parquet")

@@ -150,7 +150,7 @@ def test_only_documented_parts_of_numba_are_used() -> None:
 
 
 def test_help_loads_no_heavy_library() -> None:
-    """People avoid commands whose help takes a second to appear, or whose answer to a typo does.
+    """People avoid commands that take a second to show their help or to report a typo.
 
     Every command checks its paths with ``is_url``, which must not load the whole of `batch`.
     """

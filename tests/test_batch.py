@@ -241,7 +241,7 @@ def test_takes_are_not_mixed_in_one_run(tmp_path: Path, gap_s: float, found: int
 
 
 def test_metadata_of_a_data_set_makes_no_bag(tmp_path: Path) -> None:
-    """Taken for a bag, a folder gives one run of mixed takes; subfolders are not searched."""
+    """Taken for a bag, the folder would give one run of mixed takes, without its subfolders."""
     takes = {tmp_path / name for name in ("monday.mcap", "tuesday.bag", "more/wednesday.mcap")}
     (tmp_path / "more").mkdir()
     for take in takes:

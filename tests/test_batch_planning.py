@@ -321,7 +321,7 @@ def test_write_ahead_log_is_content_of_its_database(tmp_path: Path, *, whole: bo
 
 
 def test_unneeded_digest_is_stopped(source: Path) -> None:
-    """Stopping is not an error before the thread starts, and ends it afterwards."""
+    """Stopping must not fail before the thread starts, and must end a thread that runs."""
     before = threading.active_count()
     with ContentDigest(source):
         assert threading.active_count() == before
@@ -753,7 +753,7 @@ def test_batch_notices_run_that_was_replaced_alone(
 def test_batch_notices_run_at_url_that_was_replaced(
     source: Path, monkeypatch: pytest.MonkeyPatch, there: Callable[..., Any] | None, status: str
 ) -> None:
-    """A command for one recording writes no manifest there, and one with shards writes another."""
+    """A command for one recording writes no manifest; one with shards writes a different one."""
     (source.parent / "other.mcap").write_bytes(b"another")
     out, job = f"memory://replaced-{id(there)}", Job(Path(), Path())
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
@@ -785,7 +785,7 @@ def overwritten(sources: Path, out: Path, *, most: int = 9, **changes: Any) -> d
 def test_interrupted_overwriting_continues(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Repeated after an interruption, a command keeps what it has finished; others replace all."""
+    """A command repeated after an interruption keeps what it finished; another one replaces all."""
     (source.parent / "other.mcap").write_bytes(b"another")
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
 
@@ -815,7 +815,7 @@ def test_interrupted_overwriting_continues(
 def test_overwriting_again_after_a_failure_replaces_all(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A command with a damaged recording is not interrupted: given again, it replaces all runs."""
+    """A failed recording is no interruption: the same command, given again, replaces all runs."""
     (source.parent / "broken.mcap").write_bytes(b"damaged")
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
     begun: list[str] = []
@@ -838,7 +838,7 @@ def test_overwriting_again_after_a_failure_replaces_all(
 
 
 def test_times_of_manifest_are_in_utc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Machines in different zones write one manifest, of which the latest entry counts."""
+    """Machines in different time zones write one manifest, of which the latest entry counts."""
     monkeypatch.setenv("TZ", "Asia/Kathmandu")
     time.tzset()
     try:
@@ -932,7 +932,7 @@ def test_last_line_of_a_recording_counts(tmp_path: Path) -> None:
 
 
 def test_entry_with_zero_tracks_is_not_read_as_unknown(tmp_path: Path) -> None:
-    """Unknown tracks would be looked up in the run again."""
+    """If zero tracks were read as unknown, the run would be opened again to count them."""
     path = tmp_path / "manifest.jsonl"
     Manifest(path).record([Entry("a", "a.mcap", "complete", seconds=0.0, frames=3, tracks={})])
     read = Manifest(path).entries["a"]
@@ -942,7 +942,7 @@ def test_entry_with_zero_tracks_is_not_read_as_unknown(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("part_bytes", [1, 10**6])
 def test_manifest_at_url_ends_as_one_file(monkeypatch: pytest.MonkeyPatch, part_bytes: int) -> None:
-    """The file has the last line of each recording, also of two lines of the same millisecond."""
+    """Only the last line of each recording is kept, also of two with the same millisecond."""
     monkeypatch.setattr("shapecat.batch.manifest._PART_BYTES", part_bytes)
     place = f"memory://one-file-{part_bytes}"
     with RemoteManifest(place) as manifest:

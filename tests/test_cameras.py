@@ -113,7 +113,7 @@ def test_identity_is_not_a_calibration() -> None:
 
 
 def test_error_shows_the_focal_length_that_is_wrong() -> None:
-    """Engines with y up give a negative focal length in y; the error must not show that in x."""
+    """Simulators whose y axis points up give a negative fy; the error must not show fx instead."""
     k = np.diag([500.0, -510.0, 1.0]).ravel()
 
     with pytest.raises(MessageError, match="focal length -510"):
@@ -230,7 +230,7 @@ WIDE = (4.7247, 3.2092, 0.0, 0.0001, 0.1706, 5.0559, 4.7758, 0.8865)
 
 
 def test_wide_lens_is_inverted_up_to_its_edge() -> None:
-    """The edge is so compressed that slow convergence would pass for a lens without inverse."""
+    """At the edge, the solver converges so slowly that the lens might seem to have no inverse."""
     camera = Camera(64, 64, 31.5, 31.5, 32.1, 31.8)
     rays = undistorted_rays(camera, "rational_polynomial", WIDE)
     assert rays is not None
@@ -309,8 +309,8 @@ def test_rays_agree_with_pixels_to_a_thousandth_of_a_pixel() -> None:
 
 def test_up_is_rotated_from_fixed_frame_into_sensor_frame() -> None:
     """Z of the fixed frame, seen by the sensor, is the last row of fixed_from_sensor."""
-    from shapecat.recordings.transforms.buffer import TransformBuffer  # noqa: PLC0415  the same
-    from shapecat.recordings.transforms.gravity import PoseFinder  # noqa: PLC0415  used only here
+    from shapecat.recordings.transforms.buffer import TransformBuffer  # noqa: PLC0415  used only here
+    from shapecat.recordings.transforms.gravity import PoseFinder  # noqa: PLC0415  the same
     from shapecat.recordings.transforms.window import TransformWindow  # noqa: PLC0415  the same
 
     turn = Rotation.from_euler("xyz", [-2.1, 0.3, 0.8])

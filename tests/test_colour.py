@@ -84,7 +84,7 @@ def test_points_are_projected_up_to_turning_point_of_lens(
 
 
 def test_splatted_labels_agree_with_projected_points() -> None:
-    """The kernel and the plain projection must place each pixel equally."""
+    """The kernel and the plain projection must agree on the place of each pixel."""
     depth = np.zeros((120, 160), np.float32)
     labels = np.zeros((120, 160), np.int32)
     rng = np.random.default_rng(3)
@@ -343,7 +343,7 @@ def masks_of_labels(labels: Any) -> tuple[Mask, ...]:
 
 
 def test_masks_of_two_objects_do_not_overlap() -> None:
-    """Closing gaps must not join neighbouring objects, nor objects across the table."""
+    """Closing gaps must not extend objects over the table or into each other."""
     labels = np.zeros((20, 40), np.int32)
     labels[5:15, 5:15], labels[5:15, 17:27] = 1, 2
     labels[9, 10] = labels[10, 20] = 0  # a pixel each

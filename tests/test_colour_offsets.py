@@ -31,7 +31,7 @@ def write_tables(
 
     Parameters
     ----------
-    poses : those in the tables: ``right``, ``none``, or ``still``, as in a frame of the robot.
+    poses : poses in the tables: ``right``, ``none``, or ``still``, in a frame that moves along.
     object_speed_m_s : speed of the objects.
     """
     objects = np.array([[0.1, 0.3, 1.9], [0.8, -0.4, 1.2], [1.4, 0.1, 1.5]])

@@ -55,7 +55,7 @@ def run(coloured_run: Path) -> Path:
 
 
 def test_masks_of_run_match_simulated_truth(run: Path) -> None:
-    """The way from recording to table is tested; every object of more than 2000 pixels counts."""
+    """All steps from recording to table are tested, on each object of more than 2000 pixels."""
     source = run.parents[1] / "table.mcap"
     truth = np.load(source.with_suffix(".color_labels.npz"))["labels"]
     found = list(read_masks(run))

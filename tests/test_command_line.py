@@ -516,7 +516,7 @@ def test_view_without_display_suggests_web_viewer(
 def test_view_distinguishes_missing_run_from_missing_review(
     shapecat: Run, runs: Path, tmp_path: Path
 ) -> None:
-    """A mistyped path, or a folder of runs, must not suggest processing again."""
+    """The error for a mistyped path or a folder of runs must not suggest processing again."""
     for path in (tmp_path / "nothing", runs, runs / "a"):
         result = shapecat("view", path)
         assert result.exit_code == 1
@@ -745,7 +745,7 @@ def test_closed_stdout_does_not_change_the_exit_code(tmp_path: Path) -> None:
 
 @contextmanager
 def unwritable_stderr(how: str) -> Iterator[None]:
-    """Close stderr during the block, or let it lead to a full disk or to a reader that left."""
+    """Close stderr during the block, or connect it to a full disk or to a pipe without reader."""
     before, (reader, pipe) = os.dup(2), os.pipe()
     os.close(reader)
     with Path("/dev/full").open("w") as full:

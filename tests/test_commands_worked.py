@@ -65,7 +65,7 @@ def test_time_left_follows_remaining_bytes(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_time_left_falls_during_a_recording(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By finished recordings alone, the time left would grow; compiling must not count."""
+    """Estimated from finished recordings alone, it would grow; compiling must not count."""
     now = 0.0
     monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
     progress = PROGRESS.Progress([task("a", size=100), task("b", size=300)])
@@ -203,7 +203,7 @@ def test_lost_labels_are_reported_in_a_batch_of_any_size(
 def test_simulate_replaces_no_file_without_overwrite(
     shapecat: Run, tmp_path: Path, name: str, options: tuple[str, ...]
 ) -> None:
-    """The ground truth may remain where the recording itself was moved elsewhere."""
+    """The ground truth may have stayed behind when the recording was moved."""
     (tmp_path / name).write_text("mine")
     found = shapecat("simulate", tmp_path / "a.mcap", *options, "--frames", 1)
 

@@ -188,7 +188,7 @@ def coco_text(**changes: dict[str, str]) -> str:
 
 
 def test_coco_crowd_has_undecidable_category() -> None:
-    """Other tools mark ambiguous objects as crowds: they count as found, without a category."""
+    """Other tools mark ambiguous objects as crowds; these count as found, without a category."""
     square = [[1, 0, 3, 0, 3, 2, 1, 2]]
     annotations = [
         {"id": k, "image_id": 7, "category_id": 4, "segmentation": square, "iscrowd": k}
@@ -210,7 +210,7 @@ def test_coco_crowd_has_undecidable_category() -> None:
 @pytest.mark.parametrize("track", [0, 7])
 @pytest.mark.parametrize("attribute", [False, True])
 def test_coco_tracks_are_read_from_field_or_attribute(track: int, attribute: bool) -> None:
-    """CVAT writes tracks as an attribute, from 0. If an object has none, no tracks are compared."""
+    """CVAT writes track numbers, from 0, as an attribute. If one is missing, none are compared."""
     own: dict[str, Any] = {"track_id": track}
     own = {"attributes": {**own, "x": 3}} if attribute else own
     item = {"id": 1, "image_id": 2, "category_id": 4, "segmentation": [[1, 0, 3, 0, 3, 2, 1, 2]]}
@@ -236,7 +236,7 @@ def truth(tmp_path: Path) -> Path:
 
 
 def test_metrics_match_hand_calculation(run: Path, truth: Path) -> None:
-    """Cup 20 pixels; can 16, of which 12 are found; box 15; one miss; 2 labelled surplus."""
+    """In pixels: cup 20; can 16, of which 12 are found; box 15, missed once; labelled surplus 2."""
     figures = compare(run, truth).figures
     shared, found, true = 3 * 20 + 3 * 12 + 2 * 15, 3 * 20 + 3 * 12 + 2 * 15 + 2, 3 * (20 + 16 + 15)
 
@@ -716,7 +716,7 @@ def test_damaged_label_images_are_reported_in_one_line(tmp_path: Path, place: in
 def test_labels_of_images_with_another_size_are_refused(side: int, depth: bool) -> None:
     """A colour image has other pixels than the depth image: its labels would match nothing.
 
-    Truth of another simulated recording has another size, too, and no export changes that.
+    Truth of another recording may have another size, too, so the error names both causes.
     """
     camera = Camera(SIDE, SIDE, 20, 20, 5, 5)
     frame = Frame("/d", 0, START, START, "cam", np.ones((SIDE, SIDE), np.float32), camera)

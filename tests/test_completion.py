@@ -174,7 +174,7 @@ def test_hidden_side_is_uncertain_if_object_may_be_box_or_round(
 
 
 def test_lying_bottle_is_not_as_wide_as_long() -> None:
-    """A circle around its length would have four times its footprint."""
+    """A footprint as wide as the bottle is long would be more than three times too large."""
     points, normals = cylinder(0.035, 0.25)
     lying = points[:, [2, 0, 1]] + [-0.125, 0, 0.035]
     box = estimate(lying, normals[:, [2, 0, 1]], "bottle")
@@ -301,7 +301,7 @@ def test_box_of_object_at_rest_does_not_turn_with_the_noise_of_its_yaw() -> None
 
 
 def test_box_of_round_object_at_rest_does_not_turn() -> None:
-    """The yaw of a can is chance, and views that reuse a description repeat it."""
+    """The yaw of a can is random, and views that reuse a description repeat it."""
     yaws = np.repeat(np.radians([10, 55, 85, 30, 60]), 6)
     axes, sizes = np.stack([about_z(yaw) for yaw in yaws]), np.tile([0.08, 0.08, 0.1], (30, 1))
     views = views_of(RNG.normal(0, 0.003, (30, 3)), axes, sizes)
@@ -329,7 +329,7 @@ def test_box_of_object_turned_in_place_turns_with_it(turn: float) -> None:
 
 
 def test_square_box_turned_in_place_turns_with_it() -> None:
-    """Only the yaw of a round object is chance, not that of every object with equal sides."""
+    """Only the yaw of a round object is random, not that of every object with equal sides."""
     yaws = np.radians(np.repeat([10, 50], [13, 11]))
     axes, sizes = np.stack([about_z(yaw) for yaw in yaws]), np.tile([0.1, 0.1, 0.3], (24, 1))
     views = views_of(np.zeros((24, 3)), axes, sizes)

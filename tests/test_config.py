@@ -101,7 +101,7 @@ def test_error_names_invalid_setting(override: str, message: str) -> None:
 
 
 def test_smoothing_within_voxels_is_refused() -> None:
-    """Hardly any voxel has neighbours that near: all points are dropped, all objects unknown."""
+    """Hardly any voxel has neighbours that near: without points, all objects are unknown."""
     with pytest.raises(ConfigError, match=r"at least 1\.5 times surface\.voxel_m, got 0\.003"):
         with_overrides(Settings(), ["surface.smooth_radius_m=0.003"])
 

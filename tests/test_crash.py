@@ -91,7 +91,10 @@ def kill_after(arguments: list[str], begun: Path, seconds: float) -> bool:
 
 
 def survive_kills(recording: Path, out: Path, undisturbed: Path, moments: list[float]) -> int:
-    """Kill runs at some moments, check the folder after each, then finish; return the kills."""
+    """Kill runs ``moments`` seconds after they begin, check the folder each time, then finish.
+
+    Return the number of kills.
+    """
     killed = 0
     for moment in moments:
         killed += kill_after(command(recording, out), out / ".table.partial", moment)

@@ -192,7 +192,7 @@ def test_vertical_axis_is_nearest_to_the_lines_of_the_normals() -> None:
 
 
 def slices(along: F8, across: F8, *, to_narrow: bool) -> tuple[F8, float, float]:
-    """Return width and offset (20,) of ten slices, the relative length, and the filled fraction.
+    """Return alternating width and offset (20,) of ten slices, relative length, filled fraction.
 
     With ``to_narrow``, the slices end at the narrow end.
     """

@@ -130,7 +130,7 @@ def outline_of(cloud: F8, eye: F4 = EYE) -> F4:
 
 
 def test_outline_is_independent_of_depth_errors() -> None:
-    """The outline exists because depth is noisy."""
+    """Noise moves points along their rays, which must not change the outline."""
     rng = np.random.default_rng(0)
     points, _ = half_cone(rng, slope=0.2)
     rays = points - EYE

@@ -624,7 +624,7 @@ def _named(node: Node) -> str:
 
 
 def test_hierarchy_puts_stacked_object_below_its_support() -> None:
-    """An object on another one is no child of the plane (thesis 4.5)."""
+    """An object on another one is not a child of the plane (thesis 4.5)."""
     shapes = [
         table(),
         box((-0.2, 0, 0), (0.15, 0.15, 0.08)),
@@ -845,7 +845,7 @@ def test_wall_behind_a_counter_is_not_a_table(tilt_deg: float) -> None:
 
 
 def test_can_flush_with_box_below_is_separated() -> None:
-    """Only the top face of the box beside the can separates them."""
+    """Only the strip of the box's top face that is visible beside the can separates them."""
     shapes = [table(), box((0, 0, 0), (0.2, 0.1, 0.1)), can(0, -0.005, 0.1, 0.045, 0.09)]
     scene = check(shapes, [1, 2], 0.8)
     on = [c.on_candidate for c in scene.candidates]
@@ -853,7 +853,7 @@ def test_can_flush_with_box_below_is_separated() -> None:
 
 
 def test_bottle_with_wide_neck_is_one_object() -> None:
-    """A sloping shoulder is no top face."""
+    """A sloping shoulder is not a top face."""
 
     def cone(origin: Array, rays: Array) -> Array:
         best = np.full(rays.shape[:2], np.inf)

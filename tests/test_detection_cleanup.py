@@ -248,7 +248,7 @@ def test_gap_between_two_boxes_is_not_a_hole() -> None:
 
 @pytest.mark.parametrize(("width", "torn", "filled"), [(20, 0, True), (20, 3, True), (5, 0, False)])
 def test_mouth_of_cup_seen_from_above_is_filled(width: int, torn: int, filled: bool) -> None:
-    """A floor is behind its rim like background in a handle, whose hole is smaller.
+    """The floor of a cup is behind its rim, like background in a handle, whose hole is smaller.
 
     Edges may lack depth.
     """

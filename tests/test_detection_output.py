@@ -37,7 +37,7 @@ def test_border_is_found_behind_blank_strip(rows: range, expected: int) -> None:
 
 
 def test_border_is_straight_in_first_lines_with_samples() -> None:
-    """The narrow top of an object is no border."""
+    """The narrow top of an object is not a border."""
     inv_depth = np.zeros((40, 30), np.float32)
     inv_depth[4:, 10:14] = 1
     inv_depth[6, 2] = 1

@@ -168,7 +168,7 @@ def test_assumed_plane_lies_just_below_unexplained_samples() -> None:
     up = np.array([0.36, -0.48, -0.8])
     i, j = np.mgrid[:120, :160]
     rays = np.stack([(j - 70) / 150, (i - 62) / 150, np.ones(i.shape)])
-    down = -np.tensordot(up, rays, 1)  # height below the camera, by depth
+    down = -np.tensordot(up, rays, 1)  # height below the camera, per metre of depth
     blob = np.where(j < 80, 0.9 - 0.2 * (i / 120), 0.0)
     far = np.where(j > 150, 1.4, 0.0)
     height = blob + far

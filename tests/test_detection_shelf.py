@@ -47,7 +47,7 @@ def test_wall_in_image_corner_is_not_an_object(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [313, 581])
 def test_edge_on_side_of_shelf_is_not_an_object(seed: int) -> None:
-    """It is too narrow in the image to fit a wall, and cut by a board or the border."""
+    """It is too narrow in the image to be found as a wall, and cut by a board or the border."""
     assert all(np.median(candidate) >= FIRST_OBJECT for candidate in scene_labels("shelf", seed)[1])
 
 
@@ -64,7 +64,7 @@ def test_speckled_side_of_shelf_is_not_an_object() -> None:
 
 @pytest.mark.parametrize(("seed", "label"), [(419, 20), (547, 23)])
 def test_patch_of_shelf_back_is_not_merged_with_objects(seed: int, label: int) -> None:
-    """It is smaller than most parts of walls, but exactly coplanar."""
+    """It is smaller than most parts of walls, but exactly in the plane of the back."""
     labels, candidates = scene_labels("shelf", seed)
     best = max(candidates, key=lambda candidate: np.count_nonzero(candidate == label))
     assert np.mean(best == label) > 0.8

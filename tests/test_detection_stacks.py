@@ -282,10 +282,10 @@ def test_outline_cut_by_occluder_is_not_a_width_change() -> None:
 
 
 def test_plate_overhanging_a_can_is_separated() -> None:
-    """The local plane fits at its edge take the step for a slope.
+    """The planes fitted at its edge take the step for a slope.
 
     Learned merging is off, as the plate could be the lid of the can. Flatter views are left out:
-    there, the step helps in only one or two of twenty scenes.
+    there, cutting links at steps helps in only one or two of twenty scenes.
     """
     shapes = [table(), can(0, 0, 0, 0.038, 0.06), can(0, 0, 0.06, 0.05, 0.012)]
     depth, labels = render(shapes, tilt_deg=40)

@@ -159,7 +159,7 @@ ssize_t sendfile(int out, int in, off_t *at, size_t n) {
     return real(out, in, at, n);
 }
 
-/* The wall clock jumps a day ahead, and back again, by the parity of the call it begins at. */
+/* From reading nth on, the wall clock is a day ahead if nth is odd, a day behind if it is even. */
 static long jump(void) {
     if (!counts) return 0;
     long now = atomic_fetch_add(&counts[CLOCKS], 1) + 1;

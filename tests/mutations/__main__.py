@@ -206,14 +206,17 @@ def _rank(seed: int, mutant: Mutant) -> bytes:
 
 
 def tests_of(mutant: Mutant) -> list[Path]:
-    """Return the test files that judge a mutant, and its module if it has examples."""
+    """Return the test files that judge a mutant, and its module if that has doctests."""
     fitting = max((name for name in JUDGED_BY if mutant.module.startswith(name)), key=len)
     files = [ROOT / "tests" / f"{name}.py" for name in JUDGED_BY[fitting]]
     return [mutant.file, *files] if "\n    >>> " in mutant.file.read_text("utf-8") else files
 
 
 def judge(mutant: Mutant, reached: Mapping[Path, Reached | None]) -> tuple[Mutant, str]:
-    """Run the tests that reach a mutant, then the other tests of their files."""
+    """Run the tests that reach a mutant, then the other tests of their files; return the outcome.
+
+    It is ``not judged`` if no test reaches the mutant, but a test file fails without it.
+    """
     judges = {file: reached[file] for file in tests_of(mutant)}
     reaching = {file: result for file, result in judges.items() if result and result.by(mutant)}
     if not reaching:
@@ -254,7 +257,7 @@ def main() -> int:
 
 
 def _traced(files: Sequence[Path], pool: Executor) -> dict[Path, Reached | None]:
-    """Run test files without a mutant."""
+    """Run test files without a mutant; return what each reaches, or None for a file that fails."""
     found = {}
     for file, result in zip(files, pool.map(_reach, files), strict=True):
         took = "fails" if result is None else f"{result.seconds:.1f} s"

@@ -59,7 +59,7 @@ def flipped(source: str, flip: Flip) -> ast.Module:
 
 
 def _code_nodes(tree: ast.Module) -> Iterator[ast.AST]:
-    """Yield the nodes that are executed, without annotations and unions of types by ``|``."""
+    """Yield all nodes except operations by ``|`` and ``&``, many of which are unions of types."""
     for node in ast.walk(tree):
         if not isinstance(node, ast.BinOp) or not isinstance(node.op, ast.BitOr | ast.BitAnd):
             yield node
