@@ -148,7 +148,7 @@ def test_detections_have_right_values(encoding: str) -> None:
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
 def test_markers_match_boxes(encoding: str) -> None:
-    """RViz: type 1 is a cube, type 9 a text that faces the viewer; action 2 deletes a marker."""
+    """In RViz, type 1 is a cube, type 9 a text facing the viewer, and action 2 deletes a marker."""
     markers = messages(encoding)["/shapecat/markers"].markers
     deletions, (cube, text) = markers[:4], markers[4:]
 

@@ -412,7 +412,7 @@ def test_recording_that_only_waited_has_one_try(recordings: Path, tmp_path: Path
 
 
 def test_full_disk_fails_only_large_recording(shapecat: Run, tmp_path: Path) -> None:
-    """A limit on the file size simulates a full disk."""
+    """One large recording must not cost the batch. A limit on file sizes simulates a full disk."""
     (tmp_path / "in").mkdir()
     record(tmp_path / "in" / "long.mcap", 8)
     record(tmp_path / "in" / "short.mcap", 2)

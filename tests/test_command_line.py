@@ -381,7 +381,7 @@ def test_simulate_requires_overwrite_option(shapecat: Run, tmp_path: Path, there
 
 @pytest.mark.parametrize("name", ["thesis.txt", "lab.mcap", "lab.bag", "bag/lab_0.db3"])
 def test_simulate_never_removes_foreign_folder(shapecat: Run, tmp_path: Path, name: str) -> None:
-    """A folder of recordings is no recording: all of them would be deleted."""
+    """A folder of recordings must not be deleted like a single recording."""
     mine = tmp_path / "x" / name
     mine.parent.mkdir(parents=True)
     mine.write_text("mine")
@@ -825,7 +825,7 @@ entry.run()
 def test_names_that_the_terminal_cannot_show_are_escaped(
     monkeypatch: pytest.MonkeyPatch, recording: Path, tmp_path: Path
 ) -> None:
-    """A name in another script must not end a command, nor make its JSON invalid."""
+    """A name in another alphabet must not end a command, nor make its JSON invalid."""
     path = shutil.copy(recording, tmp_path / "é机.mcap")
     printed = []
     for words in (["info", str(path)], ["info", str(path), "--json"]):

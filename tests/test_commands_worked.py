@@ -234,7 +234,7 @@ def test_empty_time_range_is_refused(
 
 
 def test_recording_option_is_refused_for_several_runs(shapecat: Run, tmp_path: Path) -> None:
-    """A folder of runs also counts as several runs; one in the making does not count."""
+    """A folder of runs also counts as several runs; an unfinished run does not count."""
     for name in ("a", "b", ".c.partial"):
         (tmp_path / "runs" / name).mkdir(parents=True)
         (tmp_path / "runs" / name / "run.json").write_text("{}")

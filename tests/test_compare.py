@@ -753,7 +753,7 @@ def half_spaces(box: Box) -> np.ndarray:
 
 
 def test_iou_of_rotated_boxes_matches_half_space_intersection() -> None:
-    """Boxes rotated about any axis, some of them disjoint, compared with SciPy."""
+    """Boxes are rotated about any axis, and some are disjoint; SciPy gives the true volumes."""
     rng, met = np.random.default_rng(5), 0
     for _ in range(60):
         a, b = (
@@ -1096,7 +1096,7 @@ def test_track_of_missing_detection_is_refused(run: Path) -> None:
 
 
 def test_coco_masks_are_read_in_all_forms(shapecat: Run, run: Path) -> None:
-    """A polygon, run lengths, and compressed run lengths of the same cup; stamps in the names."""
+    """Tools write a mask as a polygon, as run lengths, or as compressed run lengths."""
     mask = np.zeros(100, np.bool_)
     mask[CUP] = True
     columns = mask.reshape(10, 10).T.ravel()
@@ -1166,7 +1166,7 @@ def compressed(counts: list[int]) -> str:
 
 
 def test_compressed_run_lengths_are_decoded() -> None:
-    """Long, short and falling run lengths: differences of both signs, several letters."""
+    """The run lengths need differences of both signs, and several characters for one number."""
     counts = [3, 40, 1000, 5, 7, 900, 2, 1, 42]
 
     assert rle_mask(counts, 40, 50).area == 40 + 5 + 900 + 1
@@ -1271,7 +1271,7 @@ def test_labels_without_masks_may_end_with_an_empty_frame(run: Path) -> None:
 
 
 def test_kitti_dont_care_regions_are_not_objects(tmp_path: Path) -> None:
-    """Lines as in KITTI's own data, which has neither frames.csv nor spaces in types."""
+    """KITTI's own data marks ignored regions as DontCare; each would count as a missed object."""
     (tmp_path / "label_2").mkdir()
     lines = (
         "Car 0.00 0 -1.58 587.01 173.33 614.12 200.12 1.65 1.67 3.64 -0.65 1.71 46.70 -1.59",

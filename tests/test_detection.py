@@ -22,6 +22,7 @@ from shapecat.types import Box, Camera, Candidate, Frame, Plane, Scene
 
 Array = NDArray[Any]
 Shape = Callable[[Array, Array], Array]
+"""Maps an origin (3,) and rays (h, w, 3) to the depth (h, w) of a surface, inf if missed."""
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 DEFAULTS = DetectionSettings()
@@ -132,7 +133,10 @@ def render(
     noise: float = 0.0015,
     seed: int = 0,
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Return depth (h, w) of a camera looking at the origin, and the shape or -1 at each pixel."""
+    """Return depth (h, w) of a camera looking at the origin, and the shape or -1 at each pixel.
+
+    The camera is ``distance`` metres away; ``noise`` is that of inverse depth, in 1/m.
+    """
     forward, rays = looking(tilt_deg, camera)
     z, labels = np.full(rays.shape[:-1], np.inf), np.full(rays.shape[:-1], -1)
     for k, shape in enumerate(shapes):
@@ -272,9 +276,9 @@ def test_stacked_box_is_supported_by_lower_box() -> None:
 
 @pytest.mark.parametrize("high", [0.08, 0.11, 0.2])
 def test_box_behind_another_does_not_stand_on_it(high: float) -> None:
-    """The visible part of a tall box begins at the nearer top.
+    """Only the part of a tall box above the nearer box is visible, and seems to stand on that.
 
-    A low box would have no height above it.
+    Supported by the nearer box, a low box would have no height.
     """
     shapes = [table(), box((0, 0, 0), (0.22, 0.08, 0.11)), box((0, 0.12, 0), (0.12, 0.08, high))]
     scene = check(shapes, [1, 2])
@@ -283,7 +287,7 @@ def test_box_behind_another_does_not_stand_on_it(high: float) -> None:
 
 
 def test_far_wall_belongs_to_bowl() -> None:
-    """There is a depth discontinuity at the near rim."""
+    """A depth discontinuity at the near rim separates the walls."""
     check([table(), shell((0, 0, 0.09), 0.09, 0.07)], [1], least=0.8)
 
 
@@ -891,7 +895,7 @@ def test_posts_of_rack_are_not_objects() -> None:
 
 
 def test_cut_objects_are_flagged_in_clouds() -> None:
-    """The cloud of an image has the same border."""
+    """The cloud of an image has the same border as the image."""
     shapes = [table(), box((0.43, 0, 0), (0.12, 0.1, 0.1)), box((-0.1, 0, 0), (0.1, 0.1, 0.1))]
     depth, labels = render(shapes)
     frame = frame_of(depth)

@@ -126,7 +126,7 @@ def test_segment_wider_than_objects_is_rejected() -> None:
 
 
 def test_segment_near_maximum_height_is_rejected() -> None:
-    """The reference says that objects must be 2 cm lower."""
+    """As docs/reference.md says, objects must end 2 cm below the limit."""
     features = _features(400)
     features["segment"]["top_m"] = 0.1
     grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, DISCONTINUITY)

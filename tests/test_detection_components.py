@@ -48,7 +48,7 @@ def test_cells_outside_spans_are_not_written() -> None:
 
 
 def test_speckle_stays_within_arrays() -> None:
-    """Without links, every cell is a component."""
+    """Without links, every cell is a component: arrays must be large enough for so many."""
     inside, links = np.ones((9, 8), bool), np.zeros((9, 8), np.uint8)
     component = np.zeros((9, 8), np.int32)
     # Plain Python checks array bounds, which compiled code does not.

@@ -92,7 +92,7 @@ def test_plate_does_not_grow_over_adjacent_depth_error() -> None:
 
 @pytest.mark.parametrize("sensor", [KINECT, REALSENSE])
 def test_empty_tables_have_few_false_objects(sensor: Any) -> None:
-    """There is at most one on a dozen tables, whatever the sensor's depth error."""
+    """A dozen tables have at most one false object, whatever the sensor's depth error."""
     count = 0
     for seed in range(12):
         rng = np.random.default_rng(seed)

@@ -49,7 +49,7 @@ def grid_of(meshes: list[Mesh], distance_m: float = 1.0) -> DepthGrid:
 
 
 def tiles(step: float, size: float, height: float) -> list[Mesh]:
-    """Return a table with 5 x 5 boxes on it."""
+    """Return a table with 5 x 5 boxes, ``size`` wide and ``height`` high, ``step`` metres apart."""
     places = (np.arange(5) - 2) * step
     boxes = [block(x, y, 0, (size, size, height)) for x in places for y in places]
     return [block(0, 0, -0.03, (5 * step, 5 * step, 0.03)), *boxes]
@@ -226,7 +226,7 @@ def test_no_plane_is_assumed_for_few_samples_or_above_camera() -> None:
 
 @pytest.mark.parametrize("first", [3002, pytest.param(3005, marks=pytest.mark.many)])
 def test_objects_are_found_on_hardly_visible_boards(first: int) -> None:
-    """Without a plane below them, all objects in these compartments are lost."""
+    """Without the plane of a board, all objects on it are lost."""
     found = total = 0
     for seed in range(first, first + 2):
         _, overlap = evaluate("shelf bin", "kinect", seed, 1, load_model(None), Settings())

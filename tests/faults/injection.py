@@ -191,7 +191,7 @@ def build_shim(folder: Path) -> Path | None:
 
 
 def shimmed(library: Path, kind: str, nth: int, case: Path) -> dict[str, str]:
-    """Reset the counts of ``case``; return variables that make its ``nth`` call fail first."""
+    """Return an environment in which the ``nth`` call on files of ``case`` is the first to fail."""
     counts = case.with_name(f"{case.name}.counts")
     counts.write_bytes(bytes(24))
     return {

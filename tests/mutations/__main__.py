@@ -213,9 +213,9 @@ def tests_of(mutant: Mutant) -> list[Path]:
 
 
 def judge(mutant: Mutant, reached: Mapping[Path, Reached | None]) -> tuple[Mutant, str]:
-    """Run the tests that reach a mutant, then the other tests of their files; return the outcome.
+    """Return a mutant and its outcome; the tests that reach it run first, then those beside them.
 
-    It is ``not judged`` if no test reaches the mutant, but a test file fails without it.
+    The outcome is ``not judged`` if no test reaches the mutant, but a test file fails without it.
     """
     judges = {file: reached[file] for file in tests_of(mutant)}
     reaching = {file: result for file, result in judges.items() if result and result.by(mutant)}
