@@ -182,7 +182,7 @@ def test_mask_is_dense_at_any_distance_of_colour_camera(ahead: float) -> None:
 
 
 def test_closed_gaps_are_measured_in_depth_pixels() -> None:
-    """In a colour image three times as fine, a crack of 3 is closed and a gap of 10 is not."""
+    """In a colour image three times as fine, 3 depth pixels are a crack to close, 10 are a gap."""
     depth = np.zeros((120, 160), np.float32)
     depth[40:80, 40:55] = depth[40:80, 58:80] = depth[40:80, 90:110] = 1.0
     frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)

@@ -204,7 +204,7 @@ def about_z(yaw: float) -> np.ndarray:
 
 
 def rectangular(size: np.ndarray) -> np.ndarray:
-    """Return the extent of a rectangle from its centre in each direction."""
+    """Return the extents (DIRECTIONS,) of a rectangle from its centre, one for each direction."""
     angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
     return np.asarray(abs(np.cos(angles)) * size[0] / 2 + abs(np.sin(angles)) * size[1] / 2)
 

@@ -790,7 +790,7 @@ def test_objects_are_detected_in_fused_cloud_of_two_sides() -> None:
 
 
 def test_hidden_wall_in_fused_cloud_is_not_an_object() -> None:
-    """The limits of size also apply to what the virtual camera does not see."""
+    """The size limits also apply to what the virtual camera does not see."""
     shapes = [table(), box((-0.12, 0, 0), (0.1, 0.1, 0.12)), box((0, 0.3, 0), (0.9, 0.03, 0.25))]
     points = np.concatenate([world_points(shapes, 0, 0), world_points(shapes, 180, 1)])
     scene = found(Frame("cloud", 0, 0, 0, "table", points=points))
