@@ -59,7 +59,7 @@ from shapecat.runs.labels.meaning import order_categories
 
 
 def test_calibration_error_weights_bins_by_views() -> None:
-    """Two of three views are right at 0.9; one view is wrong at 0.6."""
+    """Of three views with a confidence of 0.9, two are right; one with 0.6 is wrong."""
     posteriors = np.array([[0.9, 0.1], [0.1, 0.9], [0.9, 0.1], [0.6, 0.4]])
     truth = np.array([0, 1, 1, 1])
 
@@ -122,7 +122,7 @@ def test_balanced_accuracy_ignores_categories_without_views() -> None:
 def visible_points(shape: str, size: float, rng: np.random.Generator) -> F4:
     """Return noisy points (n, 3) of a shape that stands at z = 0, seen from +x, +y and above.
 
-    ``size`` is its radius or half its width; both in metres.
+    ``size`` is its radius or half its width. Sizes and points are in metres.
     """
     points = rng.normal(size=(12_000, 3))
     if shape == "ball":
@@ -276,9 +276,9 @@ def test_folder_names_that_no_label_can_have_are_refused(
 
 
 def test_folder_with_decomposed_accents_is_told_from_its_category(tmp_path: Path) -> None:
-    """File managers of macOS decompose accents: `does not know café (it knows café)` helps nobody.
+    """On macOS, accents are decomposed: `does not know café (it knows café)` would help nobody.
 
-    `there is also a folder café`, for a folder with composed accents, would not help either.
+    Nor would `there is also a folder café`, if there is one with composed accents.
     """
     for name in ("box", "caf\u00e9", "cafe\u0301"):
         (tmp_path / "data" / name / "x").mkdir(parents=True)
@@ -567,7 +567,7 @@ def test_long_names_fit_into_confusion_picture() -> None:
 
 
 def worked() -> Report:
-    """Return a report in which no two numbers are equal."""
+    """Return a report whose metrics all differ, so that swapped ones are noticed."""
     return Report(
         model="m-7",
         n=57,
@@ -692,7 +692,7 @@ def test_html_and_markdown_have_each_number_in_its_place() -> None:
 
 
 def drawn(svg: str, kind: str, *names: str) -> list[tuple[str | None, ...]]:
-    """Return the attributes ``names`` of each element of a kind; ``text`` is its content."""
+    """Return attributes of all SVG elements of a ``kind``; the name `text` stands for the content."""
     found = [e for e in ET.fromstring(svg).iter() if e.tag.endswith(kind)]  # noqa: S314  ours
     return [tuple(e.text if n == "text" else e.get(n) for n in names) for e in found]
 
@@ -743,7 +743,7 @@ def test_report_pictures_are_drawn_to_scale() -> None:
 
 
 def test_markdown_page_has_its_pictures_beside_it(trained: Path, tmp_path: Path) -> None:
-    """A name with a bar would break the table, a missing file the picture."""
+    """A `|` in a name would break the table, and a missing file the picture."""
     dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
     report = evaluate_folder(dataset, trained)
     changed = replace(report, recall={"a|b": 1.0}, fused=(Fused(3, 4, 1.0, 0.25),))
@@ -839,7 +839,7 @@ def test_training_views_of_cross_validation_are_mean_over_folds(
 
 
 def test_few_unknown_shapes_are_not_a_problem_for_cross_validation() -> None:
-    """scikit-learn printed a warning that there are too few of them for all folds."""
+    """scikit-learn printed a warning that unknown shapes are too few for all folds."""
     labels, nothing = np.array([*["cup", "can"] * 3, "unknown"]), np.zeros(7)
     objects = np.arange(7).astype(str)
     views = DescribedViews(nothing[:, None], labels, objects, nothing, nothing)
@@ -890,7 +890,7 @@ def test_baselines_are_not_tested_on_unknown_shapes_alone(trained: Path, tmp_pat
 
 
 def test_accuracy_is_broken_down_by_sensor_pose(compared: Report) -> None:
-    """From above, a can looks like a plate, which one figure for all poses hides."""
+    """From above, a can looks like a plate, which a single accuracy for all poses hides."""
     assert [name for name, _ in compared.breakdowns] == ["distance", "elevation", "points"]
     assert sum(count for _, count, _ in compared.by_elevation) == compared.n
     assert compared.by_elevation[0][0] == "30-45°"

@@ -215,7 +215,7 @@ def test_views_are_sorted_by_path(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["mug/0.PCD", "mug/red/left/0.PCD"])
 def test_category_without_folders_of_objects_is_refused(tmp_path: Path, name: str) -> None:
-    """Views at another depth were left out without notice if other categories were right."""
+    """Views in too few or too many folders were silently left out if others were in place."""
     for other in ("cup/a/0.pcd", "cup/scan.ply", name, ".mug/0.pcd"):
         (tmp_path / other).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / other).touch()

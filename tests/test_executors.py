@@ -82,7 +82,7 @@ def test_workers_do_not_load_pandas(executor: Executor) -> None:
 
 
 def test_replaced_workers_leave_nothing_open() -> None:
-    """In a batch of thousands of recordings, killed workers would use up files and threads."""
+    """In a batch of thousands of recordings, lost workers would use up descriptors and threads."""
 
     def kill() -> tuple[int, int]:
         assert isinstance(one.submit(kill_self).exception(), WorkerLostError)
@@ -168,7 +168,7 @@ def test_terminate_kills_running_tasks(tmp_path: Path) -> None:
 
 
 def _refuse_threads(monkeypatch: pytest.MonkeyPatch, target: str, *, allowed: int = 0) -> None:
-    """Let only ``allowed`` threads run the method ``target``, as a limit of processes would."""
+    """Let only ``allowed`` threads run the method ``target``, as at a process limit."""
     start, started = threading.Thread.start, count()
 
     def limited(thread: threading.Thread) -> None:
@@ -181,7 +181,7 @@ def _refuse_threads(monkeypatch: pytest.MonkeyPatch, target: str, *, allowed: in
 
 
 def test_worker_without_listener_does_not_survive(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the limit of processes, the command would wait at its end for the idle worker."""
+    """At the process limit, the command would wait at its end for the idle worker."""
     others = {*active_children()}
     _refuse_threads(monkeypatch, "Worker._listen")
 
@@ -194,7 +194,7 @@ def test_worker_without_listener_does_not_survive(monkeypatch: pytest.MonkeyPatc
 
 
 def test_fewer_threads_than_workers_do_all_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the limit of processes, a batch would end with a traceback."""
+    """At the process limit, a batch would end with a traceback."""
     _refuse_threads(monkeypatch, "LocalExecutor._dispatch", allowed=1)
 
     with LocalExecutor(2) as executor:
@@ -202,7 +202,7 @@ def test_fewer_threads_than_workers_do_all_tasks(monkeypatch: pytest.MonkeyPatch
 
 
 def test_pool_without_threads_works_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the limit of processes, a recording would fail although this process can read it."""
+    """At the process limit, a recording would fail although this process can read it."""
     _refuse_threads(monkeypatch, "LocalExecutor._dispatch")
 
     alone: OrderedPool[int, int] = OrderedPool(abs, 2)
@@ -354,7 +354,7 @@ def test_ray_that_does_not_start_is_not_blamed_on_a_scheduler(
 
 
 def test_ray_keeps_no_result_of_a_finished_call(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A batch may have millions of recordings, and shutdown would wait for each of them again."""
+    """A batch may have millions of calls, and shutdown would wait for each result again."""
 
     class Reference:
         def __init__(self, *_: Any) -> None:

@@ -35,7 +35,7 @@ Run = Callable[..., Result]
 
 @pytest.fixture(scope="module")
 def run(guessed_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a corrected run: track 1 deleted, 2 of a new category with a blank, 3 unknown."""
+    """Return a corrected run: track 1 is deleted, 2 is a `wine glass` (new), 3 is unknown."""
     folder = tmp_path_factory.mktemp("corrected") / "table"
     shutil.copytree(guessed_run, folder)
     relabel(folder, {1: "delete", 2: "wine glass", 3: "unknown"})
@@ -99,7 +99,7 @@ def test_crops_are_a_data_set_with_corrected_labels(run: Path, tmp_path: Path) -
 
 
 def test_crops_are_upright_at_height_zero_with_viewpoint(run: Path, tmp_path: Path) -> None:
-    """In another frame, a view would have other descriptors than in the run."""
+    """In another coordinate frame, a view would have other descriptors than in the run."""
     export_run(read_finished(run), "crops", tmp_path)
     truth = json.loads(
         (Path(read_finished(run).info["input"]["path"]).with_suffix(".truth.json")).read_text()
@@ -488,7 +488,7 @@ def test_runs_with_errors_are_named_and_skipped(
 
 
 def test_export_without_usable_run_fails(shapecat: Run, run: Path, tmp_path: Path) -> None:
-    """The exit code is that of the runs if they all share one, otherwise 1."""
+    """If the errors of all runs have the same exit code, it is returned, otherwise 1."""
     results, out = tmp_path / "results", tmp_path / "out"
     several_runs(run, results)
     for names, code in (("bc", 3), ("bd", 1)):

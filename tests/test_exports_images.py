@@ -39,7 +39,7 @@ BAND_PX = 6
 
 @pytest.fixture(scope="module")
 def run(coloured_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a corrected run: track 1 is deleted, 2 has a new category with a blank."""
+    """Return a corrected run: track 1 is deleted, 2 is a `wine glass`, a new category."""
     folder = tmp_path_factory.mktemp("corrected") / "table"
     shutil.copytree(coloured_run, folder)
     relabel(folder, {1: "delete", 2: "wine glass"})
@@ -88,7 +88,7 @@ def test_coco_has_original_images_and_masks_of_tracks(run: Path, tmp_path: Path)
     assert 1 not in tracks
     assert tracks[2] == "wine glass"
     assert len(data["annotations"]) == count > 12
-    # An annotation 0 counts as no match in pycocotools.
+    # pycocotools takes a match with an annotation of id 0 for no match.
     assert sorted(row["id"] for row in data["annotations"]) == list(range(1, count + 1))
     wanted = {frame: masks for (_, frame), masks in read_masks(run)}
     frames = {image["id"]: image["frame"] for image in data["images"]}
@@ -103,13 +103,13 @@ def test_coco_has_original_images_and_masks_of_tracks(run: Path, tmp_path: Path)
 
 
 def side_difference(box: list[int], others: Iterable[tuple[int, int, int, int]]) -> int:
-    """Return how far the sides of a box (x, y, w, h) are from those of the most similar, in px."""
+    """Return the largest distance, px, of a side of a box (x, y, w, h) from the nearest other."""
     sides = np.add(box, [0, 0, *box[:2]])
     return min(int(np.abs(np.add(o, [0, 0, *o[:2]]) - sides).max()) for o in others)
 
 
 def test_exported_masks_follow_colour_edges(coloured_run: Path, tmp_path: Path) -> None:
-    """Models learn the outlines of masks, and depth alone is off by a pixel or two."""
+    """Models learn the outlines of masks; those from depth alone are off by a pixel or two."""
     export_dataset([read_finished(coloured_run)], "coco", tmp_path / "out", ImageSelection())
     true = np.load(coloured_run.parents[1] / "table.color_labels.npz")["labels"]
     data = read_coco(tmp_path / "out")
@@ -225,7 +225,7 @@ def test_parts_of_object_are_joined_into_one_polygon() -> None:
 def test_outlines_are_sorted_by_area_and_links_add_none() -> None:
     """Links must add no area, since COCO tools compute areas from the polygons.
 
-    A hole is no part: linked to the outline, it would be subtracted from the object.
+    A hole is not a part: linked to the outline, it would be subtracted from the object.
     """
     pixels = np.zeros((20, 40), bool)
     pixels[1:3, 30:34], pixels[4:19, 2:14], pixels[9:15, 20:27] = True, True, True
@@ -512,7 +512,7 @@ def test_boxes_option_is_refused_by_formats_without_boxes(
 
 
 def test_kitti_boxes_project_onto_colour_image(run: Path, tmp_path: Path) -> None:
-    """P2, the 3D boxes and the image are three files that must describe the same camera."""
+    """P2, the 3D boxes and the image are in three files, which must be for the same camera."""
     export_run(read_finished(run), "kitti", tmp_path)
     folder = tmp_path / "table"
     with (folder / "frames.csv").open() as file:

@@ -196,7 +196,7 @@ def test_kitti_image_is_that_of_its_pinhole_camera(tmp_path: Path) -> None:
 
 
 def test_kitti_image_on_depth_pixels_has_the_depth_camera(tmp_path: Path) -> None:
-    """Drivers publish images registered to depth with the calibration of the colour camera."""
+    """Some drivers give images registered to depth the calibration of the colour camera."""
     pixels = np.random.default_rng(1).integers(0, 256, (120, 160, 3), np.uint8)
     image = ColourImage("/color", 5, 6, "optical", "rgb8", 160, 120, 480, pixels.tobytes())
     lens = LensCamera(Camera(160, 120, 144.1, 140.3, 76.2, 62.8), "plumb_bob", (0.02, 0, 0, 0, 0))
@@ -516,7 +516,7 @@ def test_yaml_files_hold_names_as_they_are_written(tmp_path: Path) -> None:
 
 
 def test_tiny_negative_yaw_is_not_written_as_360_degrees() -> None:
-    """The remainder of a negative rounding error is 360 itself, which labelCloud cannot show."""
+    """Modulo 360, a negative rounding error gives 360 itself, which labelCloud cannot show."""
     item = labelled(truncated=False, occluded=False).objects[0]
     for yaw in (-1e-12, 0.0, 1e-12):
         half = np.array([0, 0, np.sin(yaw / 2), np.cos(yaw / 2)])

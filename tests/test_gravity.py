@@ -76,7 +76,7 @@ def test_imu_up_is_smoothed_and_rotated_into_sensor_frame(tmp_path: Path) -> Non
 
 
 def test_imu_without_stamps_uses_log_times(tmp_path: Path) -> None:
-    """Depth images without stamps also use their log times."""
+    """Depth images without stamps use their log times, so both need the same clock."""
     items = [
         ("/imu", EPOCH + k * SECOND, imu(0, a, "camera"))
         for k, a in ((0, [0, -9.8, 0]), (7, [9.8, 0, 0]))
@@ -89,7 +89,7 @@ def test_imu_without_stamps_uses_log_times(tmp_path: Path) -> None:
 
 
 def test_missing_stamps_of_an_imu_are_in_the_clock_of_the_others(tmp_path: Path) -> None:
-    """Simulated time begins at 0: with log times instead, its first frames had no up direction."""
+    """Simulated time begins at 0: as 0 became the log time, the first frames had no up direction."""
     items = [
         ("/imu", EPOCH + stamp, imu(stamp, a, "camera"))
         for stamp, a in ((0, [0, -9.8, 0]), (7 * SECOND, [9.8, 0, 0]))
@@ -194,7 +194,7 @@ def test_given_up_is_dropped_only_if_no_plane_confirms_it(
 def test_topic_that_ends_early_does_not_hold_frames_back(
     monkeypatch: pytest.MonkeyPatch, up: Any, most: int
 ) -> None:
-    """All other frames of a long recording would be kept in memory, and nothing be saved."""
+    """All other frames of a long recording would be kept in memory, and none saved."""
     monkeypatch.setattr(up_check, "find_up", lambda *_: None)
     poses = PoseFinder(TransformWindow(TransformBuffer()), None, None, ("tf", "imu"))
     frames = [frame(EPOCH + k) for k in range(300)]
@@ -317,7 +317,7 @@ def test_up_without_other_source_comes_from_planes(tmp_path: Path) -> None:
 
 
 def test_imu_up_is_rotated_into_sensor_of_transformed_cloud(tmp_path: Path) -> None:
-    """The cloud is in the frame of the IMU, but up is needed in that of the sensor it is from."""
+    """The cloud is in the IMU's frame, but up is needed in the frame of the cloud's sensor."""
     items = [("/imu", EPOCH, imu(EPOCH, [1.2, -3.1, 9.0], "base"))]
     turn = Rotation.from_euler("xyz", [-1.9, 0.2, 0.6]).as_matrix()
     seen = replace(
@@ -411,7 +411,7 @@ def test_fixed_frame_is_chosen_for_all_sensors(tmp_path: Path) -> None:
     assert chosen == ["map", "map", "mount"]
 
 
-@pytest.mark.parametrize("period", [1, 6])  # the longer recording is not read at once
+@pytest.mark.parametrize("period", [1, 6])  # transforms of the longer recording are read in parts
 @pytest.mark.parametrize(("begins", "chosen"), [(4, "map"), (6, "odom")])
 def test_map_that_is_known_too_late_is_not_the_fixed_frame(
     begins: int, chosen: str, period: int, tmp_path: Path

@@ -45,7 +45,7 @@ def stage(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run(stage: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run the script as in a new process, with Numba loaded but nothing compiled."""
+    """Return a function that runs the script, as a new process would, and returns its output."""
     monkeypatch.syspath_prepend(stage)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.setattr("numba.config.CACHE_DIR", "")

@@ -89,6 +89,7 @@ def make_run(
 ) -> Path:
     """Write the tables of a run whose tracks are at the given positions.
 
+    All detections have ``size``, m, except the first one if ``first_size`` is given.
     ``frames_per_stamp`` is the number of successive frames with the same stamp. Another camera,
     with the same stamps and frame numbers, sees the ``tracks_of_other_camera``.
     """
@@ -278,7 +279,7 @@ def test_objects_that_swap_places_are_distinguished_by_time(tmp_path: Path) -> N
 def test_large_objects_are_matched_farther_at_once(
     tmp_path: Path, size: float, other: float, *, matched: bool
 ) -> None:
-    """Other settings see another part of a box: up to half of the mean width is allowed."""
+    """Other settings may find another part of a box: up to half of its mean width is allowed."""
     source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"}, size=size)
     target = make_run(tmp_path / "target", {5: static(shifted(CUP, y=0.07))}, size=other)
 
@@ -506,7 +507,7 @@ def test_second_transfer_keeps_corrected_label(tmp_path: Path) -> None:
 
 
 def test_conflicting_label_does_not_block_the_others(tmp_path: Path) -> None:
-    """A user merged a track of the target that the source says to delete."""
+    """A user merged #6 of the target with #5, which the source says to delete."""
     labels = {1: "delete", 3: "mug"}
     source = make_run(tmp_path / "source", {1: static(CUP), 3: static(BOWL)}, labels=labels)
     objects = {5: static(CUP), 6: static(CAN), 7: static(BOWL)}
@@ -656,7 +657,7 @@ def test_identical_cups_that_swap_are_not_labelled(tmp_path: Path) -> None:
 def test_object_between_two_old_places_is_not_labelled(
     tmp_path: Path, apart: float, *, found: bool
 ) -> None:
-    """The object may be either old one: a difference of 5 mm in distance is chance."""
+    """The object may be either of them: a difference of 5 mm in distance is chance."""
     places = {1: static(CUP), 2: static(shifted(CUP, y=apart))}
     source = make_run(tmp_path / "source", places, labels={1: "mug", 2: "tin"})
     target = second(tmp_path / "target", {1: static(shifted(CUP, y=0.02))})

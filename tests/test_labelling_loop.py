@@ -42,7 +42,7 @@ def table_with_glasses(seed: int) -> World:
 
 
 def track_objects(recording: Path, folder: Path) -> dict[int, tuple[int, str]]:
-    """Return each track's true label and category, by most of its points; ``delete`` if none."""
+    """Return the true label and category of most points of each track; ``delete`` if no object."""
     frames = json.loads(recording.with_suffix(".truth.json").read_text())
     names = {item["label"]: item["category"] for frame in frames for item in frame["objects"]}
     labels = np.load(recording.with_suffix(".labels.npz"))["labels"]
@@ -65,7 +65,7 @@ def true_categories(recording: Path, folder: Path) -> dict[int, str]:
 
 
 def correct_objects(recording: Path, folder: Path) -> set[int]:
-    """Return the labels of objects of known categories whose tracks all have that category."""
+    """Return the labels of objects of known categories whose tracks are all categorized right."""
     predicted, objects = categories(folder), track_objects(recording, folder)
     known = {label for label, name in objects.values() if name in CATEGORIES}
     return known - {label for track, (label, name) in objects.items() if predicted[track] != name}

@@ -31,7 +31,7 @@ from tests.run_info import run_info
 from tests.track_tables import write_tracks
 
 HEADER = "track,first_s,category,confidence,label,topic\n"
-QUARTER = np.array([-(0.5**0.5), 0, 0, 0.5**0.5])  # the box stands along -y
+QUARTER = np.array([-(0.5**0.5), 0, 0, 0.5**0.5])  # the z axis points down, along y
 ORIGINAL = HEADER + "".join(
     f"{track},0.000,{category},0.500,,/depth\n"
     for track, category in [(4, "unknown"), (2, "can"), (1, "cup"), (3, "cup")]
@@ -280,7 +280,7 @@ def test_table_edited_in_place_keeps_its_original(run: Path) -> None:
 
 
 def test_original_table_excludes_labels_not_yet_applied(run: Path) -> None:
-    """A user may edit tracks.csv and adopt labels of another table as well."""
+    """A user may edit tracks.csv, then adopt another table: the edits would count as original."""
     (run / "tracks.csv").write_text(labelled(t4="bowl"))
     other = run.parent / "other"
     shutil.copytree(run, other)
@@ -521,7 +521,7 @@ def test_missing_lines_keep_their_label(run: Path) -> None:
 
 
 def edited_table(folder: Path, content: bytes, tracks: Sequence[int] = (4,)) -> Path:
-    """Write a table as a person saved it, beside the original table of ``tracks``, all unknown."""
+    """Write ``content`` to tracks.csv, beside an original table in which ``tracks`` are unknown."""
     lines = [f"{track},unknown,0.5,\n" for track in tracks]
     original = "track,category,confidence,label\n" + "".join(lines)
     (folder / "tracks.original.csv").write_text(original)
@@ -589,7 +589,7 @@ def test_labels_survive_a_spreadsheet(run: Path, label: str) -> None:
 
 
 def test_new_table_with_umlauts_opens_in_a_spreadsheet(tmp_path: Path) -> None:
-    """Corrections were refused, as Excel had changed the categories of a model with umlauts."""
+    """Corrections were refused, as Excel had changed the umlauts in the model's categories."""
     line = dict.fromkeys(_CSV, 1) | dict.fromkeys(("category", "guess", "topic", "run"), "Krügel")
     _write_csv(tmp_path / "tracks.csv", [line])
 

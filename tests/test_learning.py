@@ -114,7 +114,7 @@ def test_prediction_matches_fitted_chain() -> None:
 
 
 def test_first_tree_makes_the_best_split(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The formula is evaluated for every split of every feature."""
+    """The gain of every split of every feature is calculated by its formula."""
     data = blobs(40, 3, ("cup", "can"))
     x, y = data.descriptors, (data.labels == "can").astype(int)
     monkeypatch.setattr("shapecat.learning.boosted._COLUMNS", 1.0)
@@ -196,7 +196,7 @@ def test_unknown_shapes_are_more_novel_than_known_ones(categorizer: Categorizer)
 
 
 def test_uncertain_views_are_novel_without_unknown_examples() -> None:
-    """A data set without `unknown` gives a model that cannot predict it."""
+    """A model that did not learn `unknown` cannot predict it: low confidence must do."""
     model = fit_categorizer(
         blobs(60, 1), blobs(4000, 2), descriptor_names=NAMES, categories=CATEGORIES,
         settings=SMALL,
@@ -233,7 +233,7 @@ def test_densities_match_their_formula() -> None:
     found, z = fitted.log_densities(new), fitted.standardise(new)
     np.testing.assert_allclose(z, (new - x.mean(axis=0)) / x.std(axis=0), atol=1e-4)
     for c in range(2):
-        own = fitted.standardise(x[y == c])  # as many as kernels
+        own = fitted.standardise(x[y == c])  # each view has a kernel
         for b, block in enumerate(blocks):
             squared = ((z[:, None, block] - own[:, block]) ** 2).sum(axis=2)
             density = np.exp(-squared / (2 * fitted.widths[b] ** 2)).mean(axis=1)
@@ -278,7 +278,7 @@ def test_temperature_is_recovered(temperature: float, seed: int) -> None:
 
 @pytest.mark.parametrize("objects", [1, 8, 98])
 def test_confidence_is_limited_by_number_of_held_out_objects(objects: int) -> None:
-    """If all held-out views are right, the best fit is a confidence of 1, even for wrong labels."""
+    """If all held-out views are right, the best fit is a confidence of 1, even for later errors."""
     logits = np.eye(3)[np.arange(30) % 3] * 6.0
     temperature = fit_temperature(logits, np.arange(30) % 3, objects)
 
@@ -448,9 +448,9 @@ def test_unknown_shapes_do_not_raise_confidence(categorizer: Categorizer) -> Non
 def test_shift_of_new_categories_uses_correct_held_out_views(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Views that are already wrong cannot be lost, and those of the fit are too optimistic.
+    """Wrong views cannot be lost to a new category, and views of the fit are predicted too well.
 
-    Each fit leaves out only one part: on fewer views, the classifier would be a worse one.
+    Each fit leaves out only one part: on fewer views, the classifier would be worse.
     """
     count = 200
     rows = np.arange(count, dtype=np.float64)[:, None]

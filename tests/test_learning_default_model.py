@@ -89,7 +89,7 @@ def test_default_model_is_loaded_once() -> None:
 
 
 def test_new_simulated_objects_are_recognised(model: Categorizer) -> None:
-    """A few tables of unused seeds; the card has the real figures."""
+    """The tables have seeds that training does not use; the model card has the full results."""
     kinds = ("pan", "hammer", "shoe", "chair")
     data = collect(
         view

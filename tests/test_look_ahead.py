@@ -91,7 +91,7 @@ def test_windowed_transforms_equal_those_of_full_read(
 
 
 def test_fixed_frame_may_appear_late(tmp_path: Path) -> None:
-    """Localisation may start after the recording, and all tracks are in its frame."""
+    """Localisation may start long after the recording does, and yet all tracks are in the map."""
     with open_recording(in_mcap(tmp_path)) as recording:
         window = TransformWindow.of(recording)
 
@@ -158,7 +158,7 @@ def test_frames_of_two_sensors_may_be_out_of_order(tmp_path: Path) -> None:
 
 
 def test_transforms_logged_far_from_their_stamps_are_read(tmp_path: Path) -> None:
-    """A converter may write all transforms first; those of the last frame come with the first."""
+    """A converter may write all transforms first, even those that only the last frame needs."""
     items = [(topic, EPOCH + k, message) for k, (topic, _, message) in enumerate(moving_items())]
     items.append(("/end", EPOCH + SECONDS * SECOND, ros.make("std_msgs/msg/String", "")))
     with open_recording(ros.write(tmp_path / "a.mcap", items)) as recording:

@@ -42,7 +42,7 @@ def test_memory_does_not_grow_with_number_of_frames(tmp_path: Path) -> None:
 def test_arrow_uses_the_allocator_of_the_system_unless_the_user_chose_one(
     chosen: str | None,
 ) -> None:
-    """A user's choice was respected by the command, and then replaced."""
+    """The command started with the allocator that the user chose, but then replaced it."""
     name = "ARROW_DEFAULT_MEMORY_POOL"
     variables = {key: value for key, value in os.environ.items() if key != name}
     variables |= {} if chosen is None else {name: chosen}

@@ -28,7 +28,7 @@ def write_run(
     cells: int = 1,
     empty: Container[int] = range(2, 130, 7),
 ) -> None:
-    """Write the tables of a camera that drives along x, with a ``rotation_error`` (3, 3).
+    """Write the tables of a camera that drives along x; its poses have a ``rotation_error`` (3, 3).
 
     Objects move along x at ``object_speed_m_s``; the frames ``empty`` have none. There are
     ``cells`` equal rooms, each with such a camera.

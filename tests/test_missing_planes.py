@@ -145,7 +145,7 @@ def test_only_first_frames_without_plane_are_read_again(
 
 
 def test_no_warning_if_objects_stand_on_assumed_plane(tmp_path: Path) -> None:
-    """A heap of balls hides its table, so the tables hold no plane."""
+    """A heap of balls hides the table below it, so planes.parquet is empty."""
     centers = [(x / 10, y / 10, 0.03 * abs(x + y)) for x in range(-3, 4) for y in range(-2, 3)]
     depth, _ = render([ball(center, 0.06) for center in centers], tilt_deg=35, noise=0)
     camera = frame_of(depth).camera

@@ -138,7 +138,7 @@ def test_records_print_in_one_short_line() -> None:
 
 
 def test_object_has_its_own_mask_though_other_detections_have_no_track() -> None:
-    """Masks are in the order of the objects, which lack the detections without a track."""
+    """Masks are in the order of the objects: looked up by detection, a wrong one would be found."""
     objects = [labelled_object(k, detections=(k,)) for k in (2, 5)]
     masks = (Mask(1, 0, np.ones((2, 3), np.bool_)), Mask(4, 1, np.ones((1, 2), np.bool_)))
     image = ColourImage("/c", 5, 6, "c", "rgb8", 7, 3, 21, bytes(63))
@@ -297,7 +297,7 @@ def test_image_of_two_sensors_is_annotated_once_if_one_is_late(
 def test_simultaneous_images_of_two_cameras_are_annotated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """An image that belongs to two depth streams is annotated once."""
+    """Images of two cameras may have equal stamps. An image of two depth streams counts once."""
     images = [("/l", 5, 30), ("/r", 5, 30)] * 2 + [("/r", 9, 30), ("/cloud", 11, 1)]
     masks = [
         (("/d", k), ImageMasks(topic, stamp, stamp + 1, "c", 40, height, {0: (3, 4, 7, 9)}, {}))
@@ -312,7 +312,7 @@ def test_simultaneous_images_of_two_cameras_are_annotated(
 
 
 def test_full_box_of_merged_object_holds_part_without_one() -> None:
-    """The box would end where the full box of the other part ends."""
+    """Otherwise the box would end where the full box of the other part does."""
     left, right = (labelled_object(6, box=box_at((x, 0.1, 1), (0.1, 0.2, 0.3))) for x in (0, 0.3))
     wide = box_at((-0.05, 0.1, 1.0), (0.2, 0.2, 0.4))
 
@@ -452,7 +452,7 @@ def test_long_path_keeps_newest_positions() -> None:
 
 
 def test_path_of_ended_track_leaves_all_sensors() -> None:
-    """Only the sensor that saw a track last tells its end: other paths would stay forever."""
+    """Only the last sensor to see a track reports its end: paths on other sensors would stay."""
     drawn: list[Any] = []
     columns: Any = SimpleNamespace(
         add=lambda entity, *row, **_: drawn.append((entity, len(row[1])))
@@ -749,7 +749,7 @@ def test_export_of_other_time_range_is_not_replaced(
 
 @pytest.mark.parametrize("wrong", [{"range_s": 3}, {"range_s": ["a", 2]}, {"recordings": 3}])
 def test_marks_of_others_are_not_taken_for_exports(tmp_path: Path, wrong: Any) -> None:
-    """A file of the same name, made by another program, ended in a traceback."""
+    """An export.json that another program had made ended in a traceback."""
     (tmp_path / "export.json").write_text(json.dumps({**KITTI, "made": [], "objects": 3, **wrong}))
 
     with pytest.raises(OutputError, match="holds something else"):
@@ -1223,7 +1223,7 @@ def test_card_names_the_guess_of_an_unknown_object_only(
 
 @pytest.mark.parametrize("kind", ["cloud", "image"])
 def test_clouds_have_no_image_in_a_data_set(kind: str) -> None:
-    """Colours of points are no picture: it would be one row high."""
+    """The colours of points are not an image: it would be one row high."""
     height = 1 if kind == "cloud" else 4
     image = ColourImage("/c", 5, 6, "l", "rgb8", 6, height, 18, bytes(18 * height))
     depth = None if kind == "cloud" else np.ones((4, 6), np.float32)

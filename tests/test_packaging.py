@@ -152,7 +152,7 @@ def test_lock_file_covers_every_dependency() -> None:
 
 
 def test_only_versions_of_arrow_that_work_are_allowed() -> None:
-    """Up to version 25, Arrow converts types with pandas; `process`, which lacks it, failed."""
+    """Up to version 25, Arrow converts types with pandas; `process`, which blocks it, failed."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     (least,) = (n for n in project["dependencies"] if n.startswith("pyarrow>="))
     assert int(least.removeprefix("pyarrow>=").partition(".")[0]) >= 26

@@ -128,7 +128,7 @@ def test_objects_without_surface_are_unknown(
 
     class CertainGuesser(Guesser):
         def predict(self, descriptors: Any) -> Any:
-            """Guess something of an empty description, too."""
+            """Guess a category even from an empty descriptor."""
             return super().predict(descriptors + 1)
 
     monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: CertainGuesser())
