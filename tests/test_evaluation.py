@@ -205,7 +205,7 @@ def test_model_is_calibrated_on_held_out_instances(
 ) -> None:
     """Calibrated on the views it learned, a model would be overconfident.
 
-    The saved model has learned all views, so it takes the calibration of one that has not.
+    The saved model has learned all views, so it takes the calibration of a model that has not.
     """
     made: list[Categorizer] = []
 
@@ -692,7 +692,7 @@ def test_html_and_markdown_have_each_number_in_its_place() -> None:
 
 
 def drawn(svg: str, kind: str, *names: str) -> list[tuple[str | None, ...]]:
-    """Return attributes of all SVG elements of a ``kind``; the name `text` stands for the content."""
+    """Return attributes of all SVG elements of a ``kind``; the name `text` means their content."""
     found = [e for e in ET.fromstring(svg).iter() if e.tag.endswith(kind)]  # noqa: S314  ours
     return [tuple(e.text if n == "text" else e.get(n) for n in names) for e in found]
 

@@ -336,7 +336,7 @@ def test_missing_viewpoint_is_estimated(azimuth_deg: float) -> None:
 
 
 def test_view_of_many_points_gets_a_viewpoint() -> None:
-    """`numpy.unique` takes minutes for the cells of such a cloud: their numbers' hashes collide."""
+    """`numpy.unique` takes minutes for the cell numbers of such a cloud: their hashes collide."""
     rng = np.random.default_rng(1)
     points = rng.normal(0, 1, (400_000, 3)) * [0.05, 0.05, 0.0005]
 

@@ -314,7 +314,7 @@ def test_only_cores_of_this_job_are_used(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_quota_of_container_limits_cores(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quota: str | None, cores: int
 ) -> None:
-    """`docker run --cpus 2.5` leaves all 64 cores visible: 64 processes would share its quota."""
+    """`docker run --cpus 2.5` leaves all 64 cores visible: 64 processes would share 2.5 cores."""
     file = tmp_path / "cpu.max"
     if quota is not None:
         file.write_text(f"{quota}\n")
@@ -423,7 +423,7 @@ def test_dask_logs_no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_dask_runs_equal_calls_separately() -> None:
-    """A recording whose worker died is retried with the same call: no cached result may answer."""
+    """A retry after a worker's death is the same call, which must not return a cached result."""
     distributed = pytest.importorskip("distributed")
     client = distributed.Client(processes=False, n_workers=1, dashboard_address="127.0.0.1:0")
     with _DaskExecutor(client, None) as executor:

@@ -82,7 +82,7 @@ def kitti(folder: Path, *, truncated: bool, occluded: bool) -> KittiLabel:
 
 
 def test_kitti_line_matches_hand_calculation(tmp_path: Path) -> None:
-    """The position is the bottom of the box; alpha is the yaw minus the bearing."""
+    """The position is the middle of the bottom face; alpha is the yaw minus the bearing."""
     label = kitti(tmp_path, truncated=True, occluded=False)
 
     assert (label.kind, label.truncated, label.occluded) == ("bowl", 1.0, 0)
@@ -196,7 +196,7 @@ def test_kitti_image_is_that_of_its_pinhole_camera(tmp_path: Path) -> None:
 
 
 def test_kitti_image_on_depth_pixels_has_the_depth_camera(tmp_path: Path) -> None:
-    """Some drivers give images registered to depth the calibration of the colour camera."""
+    """For images registered to depth, some drivers publish the calibration of the colour camera."""
     pixels = np.random.default_rng(1).integers(0, 256, (120, 160, 3), np.uint8)
     image = ColourImage("/color", 5, 6, "optical", "rgb8", 160, 120, 480, pixels.tobytes())
     lens = LensCamera(Camera(160, 120, 144.1, 140.3, 76.2, 62.8), "plumb_bob", (0.02, 0, 0, 0, 0))
@@ -366,7 +366,7 @@ def test_crops_of_two_cameras_do_not_replace_each_other(tmp_path: Path, topics: 
 
 
 def test_crops_are_replaced_whatever_the_order_of_topics(tmp_path: Path) -> None:
-    """If the topics are given in another order next time, each view would be there twice."""
+    """If the topics are given in another order next time, each view would be exported twice."""
     topics = ("/left/depth", "/right/depth")
     for order in (topics, topics[::-1]):
         assert write_crops(tmp_path, crops_frames(*topics), crops_run(*order)) == 2

@@ -35,7 +35,7 @@ def runner(tmp_path_factory: pytest.TempPathFactory) -> FaultRunner:
 def test_fault_does_no_harm(runner: FaultRunner, kind: str, seed: int) -> None:
     """A fault could leave half a result, lose work, or prevent the command from resuming.
 
-    Of the quick tests, `test_stopping` interrupts, `test_crash` kills and fills the disk.
+    Among the quick tests, `test_stopping` covers interrupts; `test_crash`, kills and full disks.
     """
     try:
         verdict = runner.judge(kind, seed)

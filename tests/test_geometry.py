@@ -51,7 +51,7 @@ def test_inverse_undoes_a_transform(q: list[float], t: list[float], p: list[floa
 
 @pytest.mark.parametrize("bad", [[0, 0, 0, 0], [np.nan, 0, 0, 1]])
 def test_invalid_quaternion_is_rejected(bad: list[float]) -> None:
-    """Faulty drivers publish such quaternions in transforms."""
+    """Faulty drivers publish transforms with a quaternion of zeros or NaN."""
     with pytest.raises(ValueError, match="not a rotation"):
         rotation_from_quaternion(bad)
 

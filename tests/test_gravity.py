@@ -89,7 +89,7 @@ def test_imu_without_stamps_uses_log_times(tmp_path: Path) -> None:
 
 
 def test_missing_stamps_of_an_imu_are_in_the_clock_of_the_others(tmp_path: Path) -> None:
-    """Simulated time begins at 0: as 0 became the log time, the first frames had no up direction."""
+    """In simulated time, 0 is a valid stamp: replaced by log time, it left frames without up."""
     items = [
         ("/imu", EPOCH + stamp, imu(stamp, a, "camera"))
         for stamp, a in ((0, [0, -9.8, 0]), (7 * SECOND, [9.8, 0, 0]))

@@ -337,7 +337,7 @@ def test_detections_of_another_run_are_refused(tmp_path: Path, kept: slice) -> N
 
 
 def test_run_without_objects_misses_each_label(tmp_path: Path) -> None:
-    """An error about fixed frames, not needed for the same recording, would hide the reason."""
+    """An error about fixed frames, which one recording does not need, would hide the reason."""
     labels = {1: "mug", 2: "merge with 1"}
     objects = {1: static(CUP), 2: static(CAN)}
     source = make_run(tmp_path / "source", objects, labels=labels, fixed_frame=None)
@@ -657,7 +657,7 @@ def test_identical_cups_that_swap_are_not_labelled(tmp_path: Path) -> None:
 def test_object_between_two_old_places_is_not_labelled(
     tmp_path: Path, apart: float, *, found: bool
 ) -> None:
-    """The object may be either of them: a difference of 5 mm in distance is chance."""
+    """The object may be either of the old ones: a difference of 5 mm in distance is chance."""
     places = {1: static(CUP), 2: static(shifted(CUP, y=apart))}
     source = make_run(tmp_path / "source", places, labels={1: "mug", 2: "tin"})
     target = second(tmp_path / "target", {1: static(shifted(CUP, y=0.02))})

@@ -211,7 +211,7 @@ def test_merge_into_deleted_track_is_refused(run: Path) -> None:
 
 
 def test_tracks_of_different_topics_are_not_merged(run: Path) -> None:
-    """One number on two topics would make one annotation delete the other."""
+    """With one track number on two topics, one annotation would delete the other."""
     for topic, problem in (
         ("/other", "track #1 belongs to another topic, /other"),
         ("", "the table names no topic for track #1"),
@@ -349,7 +349,7 @@ def test_only_labels_and_additional_columns_can_be_edited(run: Path) -> None:
 
 
 def test_table_needs_no_confidence(run: Path) -> None:
-    """Only the label is read; a short table was refused, and so was one with a column removed."""
+    """Confidences are not read, but tables without that column were refused."""
     corrected = run.parent / "mine.csv"
     corrected.write_text("track,category,label\n4,unknown,bowl\n")
     adopt_labels(corrected, run)
@@ -439,7 +439,7 @@ def test_page_table_in_place_of_own_table_clears_labels_later(run: Path) -> None
 
 
 def test_linked_table_gets_corrections(run: Path) -> None:
-    """A person may keep the tables of all runs in one folder under version control."""
+    """Tables may be links to files under version control, which must get the corrections."""
     kept = run.parent / "kept.csv"
     (run / "tracks.csv").rename(kept)
     (run / "tracks.csv").symlink_to(kept)
@@ -862,7 +862,7 @@ def refusals(shapecat: Callable[..., Result], folder: Path, out: Path) -> dict[s
 def test_missing_table_of_a_run_can_be_restored(
     guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result], content: bytes | None
 ) -> None:
-    """The original table is beside the missing one, but no message named it."""
+    """The original table is in the same folder, but no message named it."""
     folder = tmp_path / "table"
     shutil.copytree(guessed_run, folder)
     (folder / "tracks.csv").unlink()

@@ -39,7 +39,7 @@ SMALL = LearningSettings(rounds=20, leaves=6, known_views=200)
 
 
 def blobs(per_category: int, seed: int, categories: tuple[str, ...] = CATEGORIES) -> Examples:
-    """Return views of 8 numbers around the centre of each category; unknown ones are far away."""
+    """Return views of 8 numbers around the centre of each category, two views per object."""
     rng = np.random.default_rng(seed)
     centres = {"cup": 0.0, "can": 2.0, "ball": 4.0, "cone": 6.0, "spoon": 8.0, UNKNOWN: -4.0}
     labels = np.repeat(categories, per_category)
@@ -114,7 +114,7 @@ def test_prediction_matches_fitted_chain() -> None:
 
 
 def test_first_tree_makes_the_best_split(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The gain of every split of every feature is calculated by its formula."""
+    """A model with inferior splits still learns, so that the gains of all are recalculated here."""
     data = blobs(40, 3, ("cup", "can"))
     x, y = data.descriptors, (data.labels == "can").astype(int)
     monkeypatch.setattr("shapecat.learning.boosted._COLUMNS", 1.0)
@@ -196,7 +196,7 @@ def test_unknown_shapes_are_more_novel_than_known_ones(categorizer: Categorizer)
 
 
 def test_uncertain_views_are_novel_without_unknown_examples() -> None:
-    """A model that did not learn `unknown` cannot predict it: low confidence must do."""
+    """A model that did not learn `unknown` cannot predict it: novelty must come from confidence."""
     model = fit_categorizer(
         blobs(60, 1), blobs(4000, 2), descriptor_names=NAMES, categories=CATEGORIES,
         settings=SMALL,
@@ -252,7 +252,7 @@ def test_density_of_training_view_leaves_out_the_view_itself() -> None:
 
 
 def test_constant_features_become_zero() -> None:
-    """A bin of a histogram that is always empty has no deviation by which to divide."""
+    """A histogram bin that is always empty has a standard deviation of 0: division gives NaN."""
     data = blobs(30, 1)
     x = data.descriptors.copy()
     x[:, 2] = 7.0

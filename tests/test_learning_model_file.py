@@ -51,7 +51,7 @@ def saved(tmp_path: Path) -> Path:
 
 
 def rewrite(path: Path, change: Callable[[dict[str, bytes]], object]) -> None:
-    """Change the members of a model file."""
+    """Apply ``change`` to the members of a model file: a dict from name to content."""
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     change(members)

@@ -114,9 +114,9 @@ def test_a_rack_has_posts_instead_of_sides() -> None:
 
 
 def _armed(world: World, arms: str) -> Iterator[tuple[np.random.Generator, Pose, World, F4]]:
-    """Add arms to a world for eight viewpoints; yield each viewpoint, its world and the vertices.
+    """Add arms to a world, for eight viewpoints in turn.
 
-    The generator is the one that placed the arms; the vertices (n, 3) are those of the arms.
+    Yield the generator that placed the arms, the viewpoint, the world and the arms' points (n, 3).
     """
     for seed in range(8):
         rng = np.random.default_rng(seed)

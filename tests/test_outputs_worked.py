@@ -138,7 +138,7 @@ def test_records_print_in_one_short_line() -> None:
 
 
 def test_object_has_its_own_mask_though_other_detections_have_no_track() -> None:
-    """Masks are in the order of the objects: looked up by detection, a wrong one would be found."""
+    """Masks are numbered like the objects, not the detections: a wrong mask would be returned."""
     objects = [labelled_object(k, detections=(k,)) for k in (2, 5)]
     masks = (Mask(1, 0, np.ones((2, 3), np.bool_)), Mask(4, 1, np.ones((1, 2), np.bool_)))
     image = ColourImage("/c", 5, 6, "c", "rgb8", 7, 3, 21, bytes(63))
@@ -522,7 +522,7 @@ def test_image_is_in_a_data_set_once(per_track: int) -> None:
 
 
 def test_most_different_views_of_track_are_selected() -> None:
-    """The first view has most pixels; each next view differs most from those already chosen."""
+    """The first view has the most pixels; each next one differs most from those already chosen."""
     columns = np.zeros((5, 8))
     columns[:, 0], columns[:, 4] = [0, 1.0, 5, 5.4, 9], [0.1, 0.3, 0.1, 0.1, 0.2]
     assert _different(columns, 3) == [1, 4, 2]
@@ -672,7 +672,7 @@ def test_export_of_another_recording_is_not_replaced(tmp_path: Path) -> None:
 
 
 def test_data_set_with_other_recordings_is_not_replaced(tmp_path: Path) -> None:
-    """Crops are added to a data set; users who expect this of images would lose the first ones."""
+    """Crops are added to a data set; users who expect the same of images would lose some."""
     monday, tuesday, both = (
         {"format": "coco", "recordings": list(names)} for names in ("a", "b", "ab")
     )

@@ -326,7 +326,7 @@ def test_damage_found_while_recording_is_rewritten_is_reported(
 def test_annotated_copy_of_damaged_recording_is_readable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Other readers stop at a damaged chunk; only the first reading of the frames meets it."""
+    """Other readers stop at a damaged chunk, which only the first reading of the frames detects."""
     monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: Guesser())
     source = mcap(tmp_path, chunk_size=20_000)
     whole = messages(source)
