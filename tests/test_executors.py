@@ -481,7 +481,7 @@ def test_processes_keep_order_and_hold_few_items() -> None:
         for k in count():
             assert k - len(used) <= _MOST_PENDING
             yield k, k
-            more -= len(workers) == 3  # others take a while to come up
+            more -= len(workers) == 3  # the others take a while to start
             if more == 0 or time.monotonic() > deadline:
                 return
 

@@ -42,11 +42,11 @@ LEVEL_FROM_SENSOR = Rotation.from_euler("x", -PITCH) * Rotation.from_euler("z", 
 """Rotation from the optical frame (x right, y down, z forward) to one with y along gravity."""
 UP = LEVEL_FROM_SENSOR.inv().apply([0, -1, 0])
 SIZE = np.array([0.31, 0.14, 0.23])
-"""Length, width and height of the box."""
+"""Length, width and height of the box, metres."""
 CENTER = np.array([-0.37, 0.52, 1.64])
 """In the level camera: 0.37 m left, 0.52 m below, 1.64 m ahead."""
 YAW = 0.7
-"""From the level camera's x axis, about its y axis, which points down."""
+"""Radians from the level camera's x axis, about its y axis, which points down."""
 AXES = np.array(  # in the level camera: length, width, up
     [[np.cos(YAW), 0, -np.sin(YAW)], [np.sin(YAW), 0, np.cos(YAW)], [0, -1, 0]]
 )

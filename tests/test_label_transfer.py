@@ -32,7 +32,7 @@ from tests.track_tables import lines
 
 Run = Callable[..., Result]
 Path3 = Sequence[Sequence[float] | None]
-"""Where an object is in each frame; None where it is not seen."""
+"""Where an object is in each frame (x, y, z), metres; None where it is not seen."""
 FRAMES_EACH = 10
 CUP, CAN, BOWL = (0.11, -0.42, 0.83), (0.34, -0.15, 0.79), (-0.27, 0.08, 0.86)
 

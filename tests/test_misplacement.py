@@ -110,7 +110,7 @@ def test_sensors_are_not_compared_with_each_other(
 
     warnings = list(explain_misplacement(tmp_path, "map"))
     assert [w.split(":")[0] for w in warnings] == topics
-    # Another name would be a command that tracks in a wrong frame again.
+    # With another name, the suggested command would track in a wrong frame again.
     assert [w.split("--fixed-frame ")[1] for w in warnings] == ["optical0", "optical1"][
         : len(topics)
     ]

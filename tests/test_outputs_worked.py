@@ -448,7 +448,7 @@ def test_long_path_keeps_newest_positions() -> None:
     assert_allclose(places[:, 0], 0.02 * np.arange(7, 507))
     paths.add("/p", (508, 508), {}, (4,))
     assert drawn[-1] == []
-    assert (sizes[0], *sizes[-2:]) == (2 * 3, 500 * 3, 0)  # or hundreds of copies are held back
+    assert (sizes[0], *sizes[-2:]) == (2 * 3, 500 * 3, 0)  # otherwise, memory fills with copies
 
 
 def test_path_of_ended_track_leaves_all_sensors() -> None:
