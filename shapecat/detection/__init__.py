@@ -12,8 +12,8 @@ Terms in all steps:
   frame.
 - ``plane`` (3,) is a, b, c of a plane's inverse depth, ``a * column + b * row + c``, 1/m. ``up``
   (3,) is a unit vector in the view frame. ``jump`` is `DepthGrid.discontinuity`, 1/m.
-- ``spans`` (rows, 2) are, for each row, the first column with a cell concerned, and one past the
-  last such column.
+- ``spans`` (rows, 2) bound the cells that matter in each row: the first column that has one, and
+  one past the last.
 """
 
 from shapecat.detection.pipeline import detect

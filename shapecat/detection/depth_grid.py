@@ -36,13 +36,13 @@ SMALL_M2 = 9e-4
 MIN_CELLS = 20.0
 """Minimum number of cells of an object; fewer may be noise."""
 ENOUGH_CELLS = 60.0
-"""Upper bound of the minimum number of cells of an object; so many are enough at any depth."""
+"""Upper bound of the minimum number of cells of an object; this many are enough at any depth."""
 BORDER_SHARE = 0.12
 """Maximum width of a blank border, as a fraction of the image. A Kinect whose depth is registered
 to its colour image leaves a tenth blank."""
 STRAIGHT_SHARE = 0.3
 """Minimum extent of the samples along the inner edge of a border, as a fraction of the image side.
-If it is less, a blank area ends only at the top of a tall object, and is no border."""
+If it is less, the blank area merely ends at a tall object, and is not a border."""
 LARGEST_FACTOR = 16
 STEP_M = 0.004
 """Smallest step between two surfaces, metres. It matters only near the camera, where even a slanted

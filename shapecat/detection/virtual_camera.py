@@ -304,9 +304,9 @@ def _project(
 
 @kernel
 def _close_holes(inv_depth: F4, jump: float) -> None:
-    """Fill each empty cell that lies between two neighbours on one surface with their mean.
+    """Set each empty cell between two opposite neighbours on one surface to their mean.
 
-    Opposite neighbours are on one surface if they differ by less than ``jump``, 1/m. ``inv_depth``
+    Two neighbours are on one surface if they differ by less than ``jump``, 1/m. ``inv_depth``
     (rows, columns) is changed in place.
     """
     rows, columns = inv_depth.shape

@@ -76,10 +76,11 @@ def extend_overhang(
 
 @kernel(inline=True)
 def _find_border(plane_id: I4, number: int, i: int, border: U1) -> bool:
-    """Mark the cells of row i above a plane that are next to cells of lower planes or of none.
+    """Mark the cells of row i that are above a plane and at the border of that region.
 
-    Returns whether there are any such cells. ``plane_id`` and ``number``, from 1, are as in
-    `HeightMap`; ``border`` (columns,) is written.
+    At least one neighbour is above a lower plane, or belongs to no plane. Returns whether there are
+    any such cells. ``plane_id`` and ``number``, from 1, are as in `HeightMap`; ``border``
+    (columns,) is written.
     """
     rows, columns = plane_id.shape
     row_above, row_below, one = max(i - 1, 0), min(i + 1, rows - 1), np.uint64(1)
@@ -103,7 +104,7 @@ def _find_border(plane_id: I4, number: int, i: int, border: U1) -> bool:
 
 @kernel(inline=True)
 def _continues(over: Overhang, i: int, j: int) -> bool:
-    """Return whether the surface at a cell above the plane continues in a neighbour outside it."""
+    """Return whether the surface at a cell above the plane continues outside its outline."""
     rows, columns = over.visited.shape
     continues, w = False, over.grid.inverse_depth[i, j]
     for di, dj in SIDES:

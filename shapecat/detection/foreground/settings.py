@@ -97,9 +97,9 @@ class WallSettings(NamedTuple):
     cleared_m2: float = 0.1
     """Minimum area of all cleared parts together."""
     free_share: float = 0.25
-    """Minimum fraction of the left and right ends of a part that are in front of a farther surface,
-    if the part is the front of an object. If a side of the object is visible too, the fraction is
-    about a half."""
+    """Minimum fraction of the left and right boundary of a part that is in front of a farther
+    surface, if the part is the front of an object. If a side of the object is visible too, the
+    fraction is about a half."""
     filled: float = 0.3
     """Minimum fraction of its extent that a wall fills. The front edges of a shelf, which are also
     in one plane, fill less."""

@@ -128,8 +128,8 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
 def _is_hidden(segments: Segments, p: int, q: int, grid: DepthGrid, labels: I4, lines: F8) -> bool:
     """Return whether an occluder hides the lines (n, 2, 3) between two segments, at least in part.
 
-    Hardly any of the lines may run through free space. ``lines``, metres, are from `_find_partners`
-    for the segments ``p`` and ``q`` of ``labels`` (rows, columns).
+    Only a small part of the lines may be in free space. ``lines``, metres, are from
+    `_find_partners` for the segments ``p`` and ``q`` of ``labels`` (rows, columns).
     """
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     free = hidden = measured = 0

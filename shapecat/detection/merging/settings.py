@@ -20,8 +20,8 @@ class MergingSettings(NamedTuple):
     gap_cells: int = 3
     """Maximum number of cells without depth within one surface."""
     shadow_cells: int = 15
-    """Maximum number of cells without depth between two surfaces: the nearer one shadows the
-    projector."""
+    """Maximum number of cells without depth between two surfaces: the nearer one blocks the
+    light of the projector."""
     inward_cells: int = 3
     """Distance from a border, in cells, at which the normal of a surface is taken."""
     down_cos: float = 0.7

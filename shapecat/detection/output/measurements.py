@@ -139,7 +139,7 @@ def _objects_below(boxes: Boxes, up: F8, k: int) -> Bool:
 
     An object may extend a little behind its visible part. If the middle of ``k`` is farther behind,
     ``k`` stands behind the object, even if the visible part of ``k`` begins at the object's top.
-    ``up`` (3,) is a unit vector, view frame.
+    ``up`` (3,) is a unit vector, view frame; ``k`` counts from 0.
     """
     count = boxes.center.shape[0]
     below = np.zeros(count + 1, np.bool_)

@@ -99,9 +99,9 @@ def _select_objects(
 ) -> list[int]:
     """Return which lists in ``indices`` have enough points, in the order of their first points.
 
-    ``indices`` are the pixels or points of each label; ``image`` says whether they are pixels.
-    Enough are at least ``min_points`` and, in an image, the pixels of
-    `ObjectMeasurements.min_cells`.
+    ``indices`` are the pixels or points of each label; ``image`` says whether they are pixels. A
+    list needs ``min_points`` and, in an image, as many pixels as `ObjectMeasurements.min_cells`
+    cells have.
     """
     limits = [float(min_points)] * len(indices)
     if image:

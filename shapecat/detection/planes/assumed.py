@@ -58,9 +58,10 @@ def assume_plane(
 
 
 def _fullest_interval(height: F8, weight: F8, max_height_m: float) -> float:
-    """Return a height just below the interval of length ``max_height_m`` with the most weight.
+    """Return a height just below the samples in the heaviest interval of length ``max_height_m``.
 
-    ``height`` (n,), metres, and ``weight`` (n,) are those of the samples.
+    At most `AssumedSettings.noise_share` of their weight is lower. ``height`` (n,), metres, and
+    ``weight`` (n,) are those of the samples.
     """
     low = float(height.min())
     count = np.bincount(((height - low) / PLANES.bin_m).astype(np.int64), weight)

@@ -99,7 +99,7 @@ def area_of(inliers: DepthSamples, plane: F8, distance: float) -> float:
     total = 0.0
     for k in range(inliers.inverse_depth.size):
         inverse_depth = plane[0] * inliers.j[k] + plane[1] * inliers.i[k] + plane[2]
-        facing = inverse_depth * distance  # the cosine between the normal and the ray
+        facing = inverse_depth * distance  # minus the dot product of normal and ray
         total += 1 / (inverse_depth * inverse_depth * (facing if facing > 0.05 else 0.05))
     return float(inliers.cells_per_sample * total)
 

@@ -38,7 +38,7 @@ MAX_PEAKS = 10
 MIN_SAMPLES = 44
 """Minimum number of points on a plane; noise alone gives a tenth of that."""
 _PEAK_BINS = 5
-"""Number of bins of heights around a peak that may belong to one plane."""
+"""Number of bins, centred on a peak, whose samples may belong to one plane."""
 
 
 def find_horizontal_planes(

@@ -33,8 +33,8 @@ class UpSettings(NamedTuple):
     """Exponent of the weight of large levels in the score of a direction. It is below 1, because a
     camera sees more of the wall behind a counter than of the counter."""
     purity_exponent: float = 2.0
-    """Exponent of the purity in the score of a direction: the fraction of the surface facing it
-    that is in large levels."""
+    """Exponent of the purity in the score. The purity of a direction is the fraction of the surface
+    facing it that is in large levels."""
     frontal_penalty: float = 0.6
     """Fraction of the score that a direction along the optical axis loses: it is likely the normal
     of a wall."""

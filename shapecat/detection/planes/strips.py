@@ -130,9 +130,10 @@ def _plane_at(grid: DepthGrid, strips: F4, up: F8, height: float) -> PlaneCandid
 def _covered(
     candidate: PlaneCandidate, strips: F4, intrinsics: PinholeIntrinsics
 ) -> PlaneCandidate:
-    """Return the candidate with its covered area: 0 if the outline is mostly visible or uncovered.
+    """Return the candidate with its ``covered_m2``.
 
-    ``strips`` (4, n) are from `_level_strips`.
+    This is the area of its outline plus that of the level tops above it, or 0 if the outline is
+    mostly visible or hardly covered. ``strips`` (4, n) are from `_level_strips`.
     """
     plane = candidate.plane
     corners = outline_corners(plane.up, plane.offset, plane.extent)

@@ -48,8 +48,8 @@ def supporting_planes(
 
     1. Drop a plane less than 6 cm high.
     2. Keep the lowest plane, or one higher than the tallest object.
-    3. Keep a plane around which the surface rises, as around the floor of a bin, unless it is
-       larger than 0.25 m2.
+    3. Keep a plane of less than 0.25 m2 around which the surface rises, as around the floor of a
+       bin, and extend it to the walls.
     4. Drop a plane of less than 0.03 m2.
     5. Keep a plane with no other below it.
     6. Drop a plane with a wall below its front edge, as below the top of a box; but keep one of at

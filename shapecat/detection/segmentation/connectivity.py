@@ -287,7 +287,7 @@ def _write_angles(plane_w: F4, worst: F4, concavity: U1) -> None:
     degrees, max_angle = np.float32(180 / math.pi), np.float32(120)
     for k in range(concavity.size):
         half = np.sqrt(worst[k]) * np.float32(0.5)
-        # arcsin by its series: 1 degree off at a right angle
+        # arcsin by its series: 2 degrees off at a right angle
         angle = 2 * degrees * (half + half * half * half * np.float32(0.18))
         angle = angle if angle < max_angle else max_angle
         concavity[k] = np.uint8(angle) if plane_w[k] > np.float32(0) else np.uint8(0)

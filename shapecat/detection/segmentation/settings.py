@@ -19,7 +19,8 @@ class SegmentationSettings(NamedTuple):
     """Minimum determinant of the covariance of the samples' positions, cells to the fourth power:
     samples in a line define no plane."""
     bridged: int = 8
-    """Widest gap within a run, in cells: starting a new run takes longer than bridging the gap."""
+    """Narrower gaps, in cells, do not end a run of cells (see `normals`): bridging them is faster
+    than starting a new run."""
     base: int = 3
     """Distance, in cells, from an edge to the surfaces that are compared on both sides of it: half
     a window of a local plane."""
@@ -29,7 +30,7 @@ class SegmentationSettings(NamedTuple):
     """Number of cells on each side of a step over which the slope there is measured."""
     step_share: float = 0.5
     """Minimum difference between the change across a step and the slope on each side of it, as a
-    fraction of a discontinuity. On one of the sides, it is at least a whole discontinuity."""
+    fraction of a discontinuity. On one of the sides, the minimum is a whole discontinuity."""
     edge_deg: int = 18
     """Minimum concave angle that may separate two objects; the inside of a 7 cm bowl turns by 16
     degrees over the same number of cells."""
@@ -46,7 +47,7 @@ class SegmentationSettings(NamedTuple):
     both_steps_m: float = 0.02
     """Minimum sum of the steps of both sides, metres."""
     bands_beside: int = 5
-    """Number of 5 mm bands below and above a step. The nearest one is left out, as a step is not
+    """Number of 5 mm bands on each side of a step. The nearest one is left out, as a step is not
     sharp; the others show the outline before and after it."""
     part_cells: int = 60
     """Minimum number of cells on either side of a split: fewer are a knob or a handle."""
