@@ -140,9 +140,9 @@ def _normal(
 ) -> tuple[float, float, float]:
     """Return the unit direction of smallest variance of the points; its sign is arbitrary.
 
-    If it is undefined, return the direction to the sensor, (ex, ey, ez); if the points are on a
-    line, its part perpendicular to the line. The first ``n_points`` elements of ``u``, ``v`` and
-    ``w`` are the offsets of the points from the neuron, in radii.
+    If it is undefined, return the direction to the sensor, (ex, ey, ez), or, if the points are on a
+    line, the component of that direction perpendicular to the line. The first ``n_points`` elements
+    of ``u``, ``v`` and ``w`` are the offsets of the points from the neuron, in radii.
     """
     su = sv = sw = suu = suv = suw = svv = svw = sww = np.float32(0)
     for k in range(n_points):

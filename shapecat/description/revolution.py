@@ -238,7 +238,7 @@ def _measure(
     """Write the profile of all points about an axis, one row of ``slices`` (k, 4) per slice.
 
     The other parameters are as in `_cylindrical_coordinates`. A row is the slice's fraction of all
-    points, the mean radius, the standard deviation from it, and the fraction of its points that
+    points, the mean and the standard deviation of the radius, and the fraction of its points that
     face the axis. Returns the root mean square of the deviations in all slices, the length along
     the axis, and the mean radius.
     """
