@@ -21,7 +21,7 @@ class Track(Record):
     hits : number of rows with a detection.
     frames : (k,) numbers of the frames on their topics, in temporal order.
     stamps_ns : (k,) times of the frames.
-    detections : (k,) number of the detection in `DetectionTable`, -1 where the track coasts.
+    detections : (k,) `DetectionTable.numbers` of the detection, -1 where the track coasts.
     centers : (k, 3) metres, in the coordinate frame of `DetectionTable.centers`.
     causal : (k, c) fused posterior of the views up to each row, over the c categories.
     posterior : (c,) fused posterior of all views.

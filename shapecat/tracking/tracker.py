@@ -45,8 +45,8 @@ class _Active:
     hits: I4
     born_ns: I4
     seen_ns: I4
-    missed: I4  # number of frames of this sensor since the last detection
-    last_topic: I4  # number of the sensor that saw it last
+    missed: I4  # number of frames of ``last_topic`` since the last detection
+    last_topic: I4  # number of the topic that saw it last
 
     def rows(self, which: Bool) -> Self:
         """Return the tracks selected by a mask."""
@@ -107,7 +107,7 @@ class Tracker:
         sizes : (n, 3) metres; the third length is along the up direction.
         posteriors : (n, c) posteriors of the single views.
         partial : (n,) whether the image border or an occluder cuts the object; none by default.
-        topic : number of the sensor. An object can be missed only by the sensor that saw it last.
+        topic : number of the topic. An object can be missed only on the topic that saw it last.
 
         Returns
         -------
