@@ -89,7 +89,7 @@ class WallSettings(NamedTuple):
     min_samples: int = 50
     """Minimum number of samples on a wall: about a hundredth of the image."""
     vertical_cos: float = 0.2
-    """Largest cosine between up and the normal of a wall: shelves lean by a few degrees."""
+    """Largest absolute cosine between up and a wall's normal: shelves lean by a few degrees."""
     min_area_m2: float = 0.05
     """Minimum area of a wall."""
     part_m2: float = 0.04

@@ -108,7 +108,7 @@ class StripSettings(NamedTuple):
     min_slope: float = 0.03
     """Smallest downward slope of a ray (down / forward); flatter rays run along a surface."""
     min_rise: float = 0.05
-    """Lower bound of the downward slope from which the area of a cell is computed."""
+    """Lower bound of the downward slope in the computation of a cell's area."""
     below: int = 10
     """Number of bins below a plane that hold almost no surface."""
     above: int = 30

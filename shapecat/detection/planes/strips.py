@@ -42,9 +42,10 @@ height of a strip."""
 def may_have_strips(
     grid: DepthGrid, points: OrientedPoints, candidates: list[PlaneCandidate]
 ) -> bool:
-    """Return whether some height has many points but few just below it, as a strip has.
+    """Return whether a plane may be visible as strips only; quicker than `add_strip_planes`.
 
-    This test is quicker than `add_strip_planes`. ``candidates`` are parallel planes, at least one.
+    There must be many points at its height, but few just below, and no large candidate (see
+    `_may_be_strips`). ``candidates`` are parallel planes, at least one.
     """
     count = _count_by_height(points, candidates[0].plane.up)
     return any(_may_be_strips(grid, candidates, *peak) for peak in _peaks(count, STRIPS.min_points))
@@ -109,7 +110,7 @@ def _is_at_range_end(inv_depth: F4, strips: DepthSamples) -> bool:
 
 
 def _widened(candidate: PlaneCandidate, covered: PlaneCandidate) -> PlaneCandidate:
-    """Return ``candidate`` with the covered area of ``covered``, and extended to its outline."""
+    """Return ``candidate``, extended to the outline of ``covered``, and with its covered area."""
     extent = np.maximum(candidate.plane.extent, covered.plane.extent)
     plane = candidate.plane._replace(extent=extent)
     return candidate._replace(plane=plane, covered_m2=covered.covered_m2)

@@ -30,7 +30,7 @@ STEPS_DOWN = 20
 EDGE_CELLS = 2
 """Number of cells over which an edge is blurred."""
 MIN_BELOW = 20
-"""Minimum number of samples below an edge from which to decide what is there."""
+"""Minimum number of samples below an edge, or around a plane, to decide what is there."""
 COUNT_STRIDE = 2
 """Step between the rows and columns of the samples that show whether something is on a plane."""
 MIN_ABOVE = 20 // COUNT_STRIDE**2

@@ -73,7 +73,7 @@ def _min_size(sizes: I4, n: int) -> tuple[int, int]:
     """Choose the largest components, as many as there is room for beside ``n`` segments.
 
     ``sizes`` (k,) are those of the components, from 1. Returns a size and a number: all larger
-    components are chosen, and this number of those of exactly that size.
+    components are chosen, and this many of exactly that size.
     """
     min_size, room = SEGMENTATION.min_cells - 1, SEGMENTATION.max_segments - n
     while True:
