@@ -120,7 +120,7 @@ def context(
 
     Returns
     -------
-    The largest horizontal width, and the horizontal widths across and along the line of sight.
+    The largest horizontal width, and those across and along the line of sight, in the same units.
     """
     weight, base = surface.weight, -surface.center[2] / surface.unit
     x, y, z = surface.neurons[0], surface.neurons[1], surface.neurons[2]

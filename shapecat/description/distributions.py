@@ -146,9 +146,9 @@ def _partition(
     at_euclidean: int,
     at_curvature: int,
 ) -> None:
-    """Write the mean of ``rows`` over the neurons in each of ``parts`` equal intervals.
+    """Write the fraction of the points and the mean histograms of each of ``parts`` intervals.
 
-    ``rows`` (n, k) are a 1 and the histograms of each neuron. The intervals divide the range of
+    ``rows`` (n, k) are a 1 and the histograms of each neuron. Equal intervals divide the range of
     ``order`` (n,); ``weight`` (n,) is each neuron's fraction of the points. The blocks of geodesic
     distances, Euclidean distances and curvature begin at ``at_geodesic``, ``at_euclidean`` and
     ``at_curvature`` in the descriptor ``out``. A neuron counts in the two intervals whose middles
