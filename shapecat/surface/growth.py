@@ -24,8 +24,8 @@ __all__ = ["Cloud", "Rates", "grow_fritzke", "grow_thesis"]
 
 
 _GAIN = 1 / 0.9995
-"""Factor by which errors gain weight with each signal, instead of a decay of all earlier errors to
-0.9995 of their size."""
+"""Factor by which each signal's error weighs more than that of the one before, instead of a decay
+of all earlier errors to 0.9995 of their size."""
 
 
 class Cloud(NamedTuple):

@@ -20,7 +20,7 @@ _SQUARINGS = 6
 
 
 def thin(points: F4, *, settings: SurfaceSettings) -> F4:
-    """Thin the points of an object for the gas: return (m, 3) metres, one point for each voxel.
+    """Thin the points of an object for the gas: return (m, 3) metres, at most one per voxel.
 
     The points of each voxel are averaged, and the averages are smoothed (differs: the thesis
     smooths the whole cloud before thinning). Smoothing the thinned points of an object takes a

@@ -56,8 +56,8 @@ def _names(features: np.dtype[Any]) -> Iterator[str]:
 def logit_of(ensemble: BoostedTrees, features: F4, lower: float, upper: float) -> float:
     """Return the logit of features (f,): the sum of the values of the leaves they reach.
 
-    It is checked after every `LANES` trees, and returned early if below ``lower`` or above
-    ``upper``.
+    If the sum after a multiple of `LANES` trees is below ``lower`` or above ``upper``, it is
+    returned early.
     """
     (roots, feature, threshold, left), value = ensemble
     leaves, logit = np.zeros(LANES, np.int32), 0.0
