@@ -70,8 +70,8 @@ def merge_fragments(fragments: Fragments, settings: TrackingSettings) -> I4:
 
     Notes
     -----
-    Cost: O(f log f) for fragments spread in space; at one position, only eight successors are
-    considered.
+    Cost: O(f log f) for fragments spread in space. For each, at most eight successors near its end
+    position, and 32 that start soon after it, are considered.
     """
     result = np.arange(len(fragments.first_ns))
     used_end, used_start = np.zeros(result.size, bool), np.zeros(result.size, bool)
@@ -166,8 +166,9 @@ def scene_cuts(table: DetectionTable, settings: TrackingSettings) -> Bool:
     disagree if fewer than half of the compared objects match one of the other frame in position,
     size and, if the frames are more than 0.3 s apart, posterior (see `_continues`). A single odd
     frame is not a cut: the frames on both sides of it must disagree too. Only frames of one topic
-    are compared, as other sensors may see other objects. Frames without detections are ignored. A
-    clock that jumps back by more than ``max_missed_s`` also begins a new scene.
+    are compared, as other sensors may see other objects. Frames without detections are ignored, but
+    a frame at most 0.3 s after one begins no scene, as objects move while out of view. A clock that
+    jumps back by more than ``max_missed_s`` also begins a new scene.
     """
     stamps, filled = table.stamps_ns, np.unique(table.rows)
     result = np.diff(stamps, prepend=stamps[:1]) < -settings.max_missed_s * 1e9
@@ -238,9 +239,10 @@ def _continues(
 
 
 def _moved_together(offsets: F8, alike: Bool) -> int:
-    """Return how many of the ``alike`` pairs (m, n) of objects share a displacement.
+    """Return the number of objects that share a displacement.
 
-    ``offsets`` (m, n, 3) are the displacements, metres; each object's shortest one is tried.
+    ``alike`` (m, n) marks the pairs that may be one object, ``offsets`` (m, n, 3) are the
+    displacements of all pairs, metres. The shortest one of each object is tried.
     """
     distance = np.where(alike, np.linalg.norm(offsets, axis=2), np.inf)
     rows = np.flatnonzero(alike.any(axis=1))
