@@ -444,7 +444,7 @@ def test_messages_compressed_one_by_one_in_mcap_are_read(tmp_path: Path) -> None
 def test_damage_found_while_a_folder_is_read_is_reported(tmp_path: Path, start: int | None) -> None:
     """The frames of a damaged part would be missing without a warning.
 
-    The next part, if there is one, begins after the damaged part ends, or before.
+    The damaged part may be the last one, or overlap the next one in time.
     """
     path = tmp_path / "bag"
     path.mkdir()
@@ -550,7 +550,10 @@ QOS = Qos(
 
 
 def two_publishers(path: Path, container: str) -> Path:
-    """Write three messages of one publisher on /a, four of another, and two on /b."""
+    """Write three messages of one publisher on /a, four of another, and two on /b.
+
+    ``container`` is mcap, ros1, or, for a ROS 2 folder, the name of a `StoragePlugin`.
+    """
     published = [("/a", "one", 3), ("/a", "two", 4), ("/b", "one", 2)]
     if container == "mcap":
         with mcap_writer(path) as writer:

@@ -259,7 +259,7 @@ def test_compressed_colour_stream_is_preferred(tmp_path: Path) -> None:
 
 
 def test_grey_images_are_used_only_on_request(tmp_path: Path) -> None:
-    """A grey camera is no colour camera, but masks can be drawn on its images."""
+    """A grey camera is not a colour camera, but masks can be drawn on its images."""
     grey = raw(EPOCH, gradient()[..., 0], "mono8", "camera")
     path = write(tmp_path / "a.mcap", [*depth_items(EPOCH), ("/cam/left/image_raw", EPOCH, grey)])
 
@@ -302,7 +302,7 @@ def test_frame_pairs_with_the_image_of_its_time_not_of_its_arrival(tmp_path: Pat
 
 @pytest.mark.parametrize("early", [False, True])
 def test_pairing_keeps_to_its_side_of_a_clock_step(tmp_path: Path, early: bool) -> None:
-    """After a clock is set back, earlier images have the same stamps: masks would be wrong."""
+    """After a clock is set back, stamps repeat: a frame could get an image from before the step."""
     stamps = [EPOCH + (33 * k - 198 * (k > 9)) * MS for k in range(20)]
     logged = [EPOCH + 33 * k * MS for k in range(20)]
     items: list[tuple[str, int, Any]] = []
@@ -330,7 +330,7 @@ def test_pairing_waits_for_image_logged_late(tmp_path: Path) -> None:
 
 
 def test_image_is_kept_for_depth_logged_late(tmp_path: Path) -> None:
-    """Depth may come dozens of colour images late; were these dropped, no frame had colour."""
+    """Depth may arrive dozens of images late; if these were dropped, no frame would have colour."""
     stamps = [EPOCH + 100 * k * MS for k in range(3)]
     items = [(t, time + 600 * MS, message) for t, time, message in depth_items(*stamps)]
     times = [EPOCH + round(k * 1000 / 60 * MS) for k in range(50)]
@@ -451,7 +451,7 @@ def test_non_finite_distortion_is_reported(tmp_path: Path, wrong: float) -> None
 
 
 def test_pose_of_colour_camera_comes_from_transforms(tmp_path: Path) -> None:
-    """A rotated pose reveals an inverse or a wrong order of frames."""
+    """The pose is rotated, so that an inverted transform cannot go unnoticed."""
     turn = (0.1, -0.2, 0.05, 0.97)
     tf = ("/tf_static", EPOCH, static("camera", "color_optical", (0.05, 0.01, -0.02), turn))
     ((_, view),), _ = read(paired(tmp_path / "a.mcap", tf))
@@ -485,7 +485,7 @@ def test_moving_colour_camera_has_new_pose_in_each_frame(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("first_s", [0.0, 0.1])
 def test_calibration_recorded_once_is_used_for_all_images(tmp_path: Path, first_s: float) -> None:
-    """A latched CameraInfo may come after the first images, or before those --start selects."""
+    """A latched CameraInfo may come after the first image, or before those that --start selects."""
     once = EPOCH + round(first_s * SECOND)
     items = [("/cam/color/camera_info", once, info(once, WIDE))]
     for stamp in (EPOCH, EPOCH + 50 * MS, EPOCH + 100 * MS):
@@ -568,7 +568,7 @@ def test_image_of_same_frame_and_other_size_is_projected(tmp_path: Path) -> None
 
 
 def test_realsense_extrinsics_are_read_column_by_column(tmp_path: Path) -> None:
-    """Read by rows, a rotated camera would face the other way."""
+    """Read row by row, the rotation would be inverted, and the camera would face the wrong way."""
     ros1 = get_typestore(Stores.ROS1_NOETIC)
     text = "std_msgs/Header header\nfloat64[9] rotation\nfloat64[3] translation\n"
     kind = "realsense2_camera/msg/Extrinsics"
@@ -697,7 +697,7 @@ def test_image_in_unknown_encoding_is_message_error() -> None:
 
 
 def test_clouds_that_lose_their_colours_are_reported(tmp_path: Path) -> None:
-    """Objects would have the colours of an earlier cloud, or none without an explanation."""
+    """Objects would have the colours of an earlier cloud or, without an explanation, none."""
     points = organized_points(wavy_depth())
     data = np.zeros(48 * 64, [("xyz", "<f4", 3), ("rgb", "<u4")])
     data["xyz"], data["rgb"] = points.reshape(-1, 3), 0x0A141E
@@ -718,7 +718,7 @@ def test_clouds_that_lose_their_colours_are_reported(tmp_path: Path) -> None:
 
 
 def test_raw_image_is_exported_as_png_with_the_same_pixels() -> None:
-    """An image with red and blue swapped would train wrong colours."""
+    """If red and blue were swapped, a model would be trained on wrong colours."""
     colours = gradient()
     raw_image = ColourImage("", 0, 0, "", "bgr8", 64, 48, 192, colours[..., ::-1].tobytes())
 

@@ -112,7 +112,7 @@ def test_destroyed_messages_count_where_messages_are_chosen(
 
 
 def test_messages_out_of_order_count_once_in_a_chunk_read_in_part(tmp_path: Path) -> None:
-    """Recorders with threads do not sort: a message would count twice, another one not at all."""
+    """Some recorders do not sort messages: one would count twice, and another one not at all."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path) as writer:
         channel = writer.register_channel("/a", "x-text", 0)
@@ -139,7 +139,7 @@ def test_damaged_index_is_not_called_missing(tmp_path: Path, *, checked: bool) -
 
 
 def test_index_that_lacks_a_chunk_is_not_used(tmp_path: Path) -> None:
-    """The chunk's messages would be missing; without a checksum, only the chunk count tells."""
+    """The chunk's messages would be missing; without a checksum, only the chunk count shows it."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, enable_crcs=False, chunk_size=60) as writer:
         channel = writer.register_channel("/a", "x-text", 0)
@@ -156,7 +156,7 @@ def test_index_that_lacks_a_chunk_is_not_used(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("damage", "wanted"), [("time", 5), ("place", 3)])
 def test_damaged_index_of_a_chunk_is_not_used(tmp_path: Path, damage: str, wanted: int) -> None:
-    """Such an index has no checksum; frames it hides would be in the tables, not in the review."""
+    """A chunk's index has no checksum; the review would lack frames that the tables have."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, compression=CompressionType.NONE) as writer:
         channel = writer.register_channel("/a", "x-text", 0)
@@ -176,7 +176,7 @@ def test_damaged_index_of_a_chunk_is_not_used(tmp_path: Path, damage: str, wante
 
 
 def test_damaged_chunk_is_reported_once_however_much_of_it_is_read(tmp_path: Path) -> None:
-    """A wrong length is found in part of a chunk, a wrong checksum in all of it: two warnings."""
+    """A read in part finds a wrong length, one in full a wrong checksum: one warning is enough."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, compression=CompressionType.NONE) as writer:
         channel = writer.register_channel("/a", "x-text", 0)
@@ -193,7 +193,7 @@ def test_damaged_chunk_is_reported_once_however_much_of_it_is_read(tmp_path: Pat
 
 
 def test_damage_is_reported_once_and_only_where_it_is_read(tmp_path: Path) -> None:
-    """Checking the index reads all chunks, but a run loses nothing if it needs other topics."""
+    """Checking the index finds damage in all chunks, also in those that a run does not need."""
     path = tmp_path / "a.mcap"
     with mcap_writer(path, enable_crcs=False, chunk_size=60) as writer:
         for name, time in (("/a", 3), ("/b", 5)):

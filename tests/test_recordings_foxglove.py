@@ -97,7 +97,7 @@ def test_coordinates_may_have_any_numeric_type(
 
 
 def test_foxglove_messages_in_ros_keep_nanoseconds(tmp_path: Path) -> None:
-    """The field is nanosec in ROS, nsec in JSON; frames of one second would share a stamp."""
+    """The field is nanosec in ROS, nsec in JSON; all frames within a second would share a stamp."""
     kind, stamp = "foxglove_msgs/msg/PointCloud", EPOCH + 123_456_789
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(_CLOUD, kind))

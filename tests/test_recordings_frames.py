@@ -210,7 +210,7 @@ def test_fitted_intrinsics_change_only_with_camera(tmp_path: Path) -> None:
 
 
 def test_earlier_camera_is_not_used_for_points_that_do_not_fit(tmp_path: Path) -> None:
-    """Converted to depth with another cloud's camera, they would become wrong points."""
+    """Converted to depth with another cloud's camera, the points would be wrong."""
     fitting = organized_points(wavy_depth())
     other = np.random.default_rng(0).normal(0, 1, fitting.shape).astype(np.float32)
     items = [("/points", k, cloud(EPOCH + k, p)) for k, p in enumerate((fitting, other, fitting))]

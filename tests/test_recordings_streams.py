@@ -61,7 +61,7 @@ def test_calibration_is_found_beside_topic_without_slash(tmp_path: Path, lead: s
 
 
 def test_calibration_below_the_topic_of_its_images_is_found(tmp_path: Path) -> None:
-    """AirSim and MultiSense publish it there; their depth and colour had no calibration."""
+    """AirSim and MultiSense publish CameraInfo there; their depth and colour had no calibration."""
     items = depth_in("/sim/front/DepthPlanar", "front")
     items[0] = ("/sim/front/DepthPlanar/camera_info", *items[0][1:])
     items += in_frame([("/sim/front/Scene/camera_info", EPOCH, info(EPOCH))], "front")
@@ -77,7 +77,7 @@ def test_calibration_below_the_topic_of_its_images_is_found(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("colour_info", ["camera_info", "color_camera_info"])
 def test_calibration_named_after_its_images_is_found(tmp_path: Path, colour_info: str) -> None:
-    """depth_image belongs to depth_camera_info, but silently got colour intrinsics, or none."""
+    """depth_image goes with depth_camera_info, but silently got colour intrinsics, or none."""
     items = depth_in("/head/depth_image", "optical")
     items[0] = ("/head/depth_camera_info", *items[0][1:])
     items += depth_in("/head/aligned_depth_to_color/image", "optical")[1:]
@@ -94,7 +94,7 @@ def test_calibration_named_after_its_images_is_found(tmp_path: Path, colour_info
 
 
 def test_calibration_of_the_same_frame_is_found(tmp_path: Path) -> None:
-    """Aligned depth has the calibration of the colour camera, which may be recorded alone."""
+    """Depth aligned to colour has the calibration of the colour camera, not the depth camera's."""
     items = depth_and_info("/cam/aligned_depth_to_color/image_raw", "/cam/color/camera_info")
     items = [
         *in_frame(items, "color"),
@@ -193,7 +193,7 @@ def test_other_measurements_are_not_taken_for_depth(tmp_path: Path, other: str) 
 
 @pytest.mark.parametrize("others", [(), ("/cam/points/xyz",)])
 def test_cloud_without_coordinates_is_chosen_last(tmp_path: Path, others: tuple[str, ...]) -> None:
-    """Zivid has a topic of normals, first in the alphabet; chosen, it gave no usable frame."""
+    """Zivid's topic of normals, the first in the alphabet, was chosen: there were no frames."""
     normals = cloud(EPOCH, organized_points(wavy_depth()))
     for field in normals.fields:
         field.name = f"normal_{field.name}"
@@ -252,7 +252,7 @@ def test_depth_needs_no_particular_name(tmp_path: Path, topic: str) -> None:
     ],
 )
 def test_infrared_image_is_not_taken_for_depth(tmp_path: Path, topic: str) -> None:
-    """Infrared may have an encoding of depth, and images are preferred to clouds."""
+    """Infrared images may be encoded like depth, and would be preferred to the clouds."""
     points = cloud(EPOCH, organized_points(wavy_depth()))
     items = [*depth_in(topic, "camera"), (f"{topic.rpartition('/')[0]}/points", EPOCH, points)]
     if topic.endswith("compressedDepth"):
@@ -326,7 +326,7 @@ def test_depth_may_be_a_png_file(tmp_path: Path, topic: str, kind: str, *, known
 
 
 def counting(monkeypatch: pytest.MonkeyPatch, module: Any, name: str) -> Counter[str]:
-    """Count the calls of a function of ``module`` in the result, under its name."""
+    """Return a counter whose entry ``name`` counts the calls of that function of ``module``."""
     calls = Counter[str]()
     function = getattr(module, name)
 
@@ -362,7 +362,7 @@ def test_streams_are_compared_in_pairs_only(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_colour_belongs_to_sensor_with_most_topic_parts_in_common() -> None:
-    """Colour images belong to the sensor whose topic name has the most parts in common."""
+    """Otherwise masks would be drawn on the colour images of another sensor."""
     left, right, far = (
         Stream(topic, IMAGE, "depth", "/info", 1, topic)
         for topic in ("/r/left/depth/image", "/r/right/depth/image", "/q/depth/image")

@@ -183,7 +183,7 @@ def test_unrelated_colour_camera_is_used_only_if_single(tmp_path: Path) -> None:
 def test_single_colour_camera_is_not_used_for_two_sensors(
     tmp_path: Path, topic: str, frame_id: str, found: str | None
 ) -> None:
-    """It may belong to either sensor; masks of the other would be drawn on the wrong view."""
+    """The camera may belong to either sensor; masks of the other one would be on the wrong view."""
     second = (topic, EPOCH, image(EPOCH, wavy_depth(), frame_id=frame_id))
     items = [*depth_items(EPOCH), second, *colour("/one/image")]
     with open_recording(record(tmp_path / "a.mcap", in_order(items))) as recording:

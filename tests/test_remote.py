@@ -216,7 +216,7 @@ def test_patterns_and_folders_of_storage_are_expanded(served: Path) -> None:
 def test_names_with_brackets_are_not_patterns(
     shapecat: Run, served: Path, tmp_path: Path, lab: str
 ) -> None:
-    """Otherwise a run folder with brackets looks empty, and files of others are overwritten."""
+    """Otherwise a run folder with brackets looks empty, and a user's files are overwritten."""
     names = ("take[1].mcap", "bag[2]/one.mcap", "bag[2]/metadata.yaml")
     for name in names[:2]:
         (Location(lab) / name).upload(served / "a.mcap")
@@ -388,7 +388,7 @@ def test_bag_in_bucket_is_processed(shapecat: Run, bucket: Path, tmp_path: Path)
 
 @pytest.mark.usefixtures("bucket")
 def test_empty_objects_that_stand_for_folders_are_ignored(made: Path, tmp_path: Path) -> None:
-    """The web console of S3 makes them; bags could not be downloaded then, nor runs uploaded."""
+    """The web console of S3 makes them; bags could not be downloaded, nor runs uploaded."""
     system: Any = fsspec.filesystem("s3")
     for key in ("marked/bag/", "marked/bag/sub/", "marked/out/run/"):
         system.call_s3("put_object", Bucket="lab", Key=key, Body=b"")
@@ -451,7 +451,7 @@ def test_copy_of_recording_finds_its_results_at_the_url(
 ) -> None:
     """A copy has another key than its original: the command failed instead of finding the run.
 
-    To find the run costs a download, which must not be repeated.
+    Finding the run costs a download, which must not be repeated.
     """
     url = "memory://copied/a"
     with claimed(url, "one") as claim:
@@ -469,7 +469,7 @@ def test_copy_of_recording_finds_its_results_at_the_url(
 def test_run_at_url_may_have_more_outputs_than_wanted(
     shapecat: Run, made: Path, served: Path
 ) -> None:
-    """With `--no-mcap`, a complete run must not be processed again, as in a local folder."""
+    """As in a local folder, a run with annotated.mcap is also complete with `--no-mcap`."""
     with claimed("memory://more/a", "one") as claim:
         upload(made, "memory://more/a", claim)
 
@@ -522,7 +522,7 @@ def test_interrupted_upload_shows_no_run(
 def test_labels_survive_killed_replacement(
     shapecat: Run, served: Path, monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
-    """With the old run gone and no new one yet, corrections must survive."""
+    """After a kill, the old run is gone and the new one not yet there; corrections must survive."""
     out, place = url.removesuffix("/run"), Location(url)
     shutil.copy(served / "a.mcap", served / "run.mcap")
     command = ("process", served / "run.mcap", "--out", out, *OPTIONS)

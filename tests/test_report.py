@@ -161,7 +161,7 @@ def test_plurals_and_time_spans_are_correct(reported_run: Path) -> None:
 
 
 def test_names_are_escaped_in_page(run: Path) -> None:
-    """Topics and categories come from files of others; scripts in them must not be executed."""
+    """Topics and categories may come from strangers; scripts in them must not be executed."""
     evil = "</script><img src=x onerror=alert(1)>"
     info = json.loads((run / "run.json").read_text())
     info["warnings"] = [evil]
@@ -226,7 +226,7 @@ def test_index_lists_runs_and_links_to_them(
 
 @pytest.mark.usefixtures("without_pictures")
 def test_index_tells_runs_of_the_same_name_apart(run: Path, tmp_path: Path) -> None:
-    """Runs of one recording with other settings have its name, in other folders."""
+    """Runs of one recording with different settings have the same name, in different folders."""
     runs = [tmp_path / name for name in ("first/lab", "#2/lab", "#2/shelf")]
     for folder in runs:
         shutil.copytree(run, folder)
@@ -356,7 +356,7 @@ def depth_frame(depth: np.ndarray) -> Frame:
 
 
 def view(blur: float = 0, left: int = 60, top: int = 50, hidden: float = 0, side: int = 80) -> Any:
-    """Return a view of a square object in a striped photograph; lengths in pixels."""
+    """Return a view of a square in a striped photo; lengths in pixels, ``hidden`` a fraction."""
     stripes = 127 + 100 * np.sign(np.sin(np.arange(240) / 3))
     photo = ndimage.gaussian_filter(np.tile(stripes, (180, 1)), blur)
     mask = Mask(left, top, np.ones((side, side), bool))
@@ -501,7 +501,7 @@ def test_unorganised_cloud_is_drawn_upright(
 
 
 def recorded(run: Path, seconds: float) -> np.ndarray:
-    """Return the recorded colour image (h, w, 3) nearest to a time, from the Python interface."""
+    """Return the colour image (h, w, 3) nearest to a time since the first frame, by the API."""
     frames = list(open_run(run).frames())
     times = [(frame.stamp_ns - frames[0].stamp_ns) * 1e-9 for frame in frames]
     colour = frames[int(np.argmin(np.abs(np.subtract(times, seconds))))].color
@@ -733,7 +733,7 @@ def test_escape_leaves_label_as_it_was(browser: Browser, reported_run: Path) -> 
 
 
 def test_focus_leaves_text_field_before_next_key(browser: Browser, reported_run: Path) -> None:
-    """The focus left a moment later, and thus left the field that the next key had opened."""
+    """The focus moved away too late, and so left the field that the next key had opened."""
     browser.open(reported_run / "report.html")
     track = read_track_table(reported_run / "tracks.csv").rows[0].track
     browser.run(
@@ -836,7 +836,7 @@ def test_page_and_annotate_accept_the_same_labels(
 def test_page_refuses_to_delete_a_track_that_others_are_merged_with(
     browser: Browser, reported_run: Path
 ) -> None:
-    """Labels given by keys must be checked like typed ones, and these in upper and lower case."""
+    """Labels given by keys must be checked like typed ones, and typed ones in any letter case."""
     page = reported_run / "report.html"
     a, b = (row.track for row in read_track_table(reported_run / "tracks.csv").rows[:2])
     browser.open(page)

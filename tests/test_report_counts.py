@@ -64,7 +64,7 @@ def test_page_and_index_count_the_labelled_tracks(
 def test_counts_follow_corrections_on_the_page(
     browser: Browser, run: Path, drawn: RunReport, labelled: dict[int, str]
 ) -> None:
-    """Counts must equal those of a page written after the corrections, also after an undo."""
+    """The page must count like one written after the corrections; undo must restore its counts."""
     reports = Reports([replace(drawn, folder=run)])
     (page,) = reports.write()
     script = """

@@ -104,7 +104,7 @@ def order_of(browser: Browser) -> list[int]:
 
 
 def other_than(category: str, number: int) -> int:
-    """Return the digit of another category than this; ``number`` varies the choice."""
+    """Return the digit key of a category other than ``category``; ``number`` varies the choice."""
     digit = 1 + number % len(NAMES)
     return digit if NAMES[digit - 1] != category else 1 + digit % len(NAMES)
 
@@ -286,7 +286,7 @@ FOREIGN_REQUESTS = {
     "a name that begins alike": (KNOWN, {"Host": "127.0.0.1.evil.example:80"}),
     "no host": (KNOWN, {"Host": ""}),
 }
-"""The path of a request, and its headers."""
+"""Path and headers of each request that must be refused."""
 
 
 @pytest.mark.parametrize("stranger", FOREIGN_REQUESTS)

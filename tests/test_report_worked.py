@@ -127,10 +127,10 @@ def test_card_has_right_values() -> None:
 
 @pytest.mark.parametrize("topics", [("/d", "/d"), ("/d", "/e")])
 def test_strip_boxes_have_right_positions(topics: tuple[str, str]) -> None:
-    """Left and width are fractions of the width, top and height of the height.
+    """Boxes are in fractions: left and width of the image's width, top and height of its height.
 
-    Topics are named if there are several. Captions tell frames less than 0.1 s apart from each
-    other, and say if the picture is shaded depth.
+    Topics are named if there are several. Captions have two decimals, as frames may be less than
+    0.1 s apart, and say if the picture is shaded depth.
     """
     boxes = {17: (50, 30, 20, 15), 99: (1, 2, 3, 4)}
     few = StripFrame("data:few", 200, 100, 0.52, topics[0], boxes)
@@ -347,7 +347,7 @@ def test_merged_tracks_count_once_in_index(run: Path) -> None:
 
 
 def test_detection_with_number_zero_is_a_view(run: Path) -> None:
-    """Only a row without a detection number is no view; 0 must not be taken for none."""
+    """Only a row without a detection number is not a view; 0 must not be taken for none."""
     table = pq.read_table(run / "tracks.parquet")
     rows = table.to_pylist()
     rows[3]["detection"] = None
@@ -422,7 +422,7 @@ def test_strip_is_sorted_by_time(run: Path) -> None:
 
 
 def test_strip_frames_show_new_tracks_first() -> None:
-    """Of every 3 frames, the strip has that with most new tracks, else most, else the middle."""
+    """Of 3 frames, that with most new tracks is shown; ties go to most tracks, then the middle."""
     stamps = [(7_000_000_000 + 500_000_000 * k, ("/d", k)) for k in range(36)]
     tracks = {0: {1}, 1: {1, 2}, 3: {1, 2}, 5: {3}, 6: {1}, 7: {2}, 8: {3}, 9: {1, 2, 3}, 10: {1}}
     strip = choosing._strip(stamps, {("/d", k): seen for k, seen in tracks.items()})
@@ -461,7 +461,7 @@ def test_whole_views_are_preferred_to_larger_cut_ones(
 
 
 def test_the_largest_masks_of_a_track_are_not_shown() -> None:
-    """They often include some table; in each quarter of a track, complete views are preferred."""
+    """They often include some table; complete views are preferred in each quarter of the track."""
     sizes = [500, 530, 2000, 510, 520, 540]
     views = [choosing._View(("/d", k), size, complete=True) for k, size in enumerate(4 * sizes)]
     cut = [choosing._View(("/d", k), 9000.0 + k, complete=False) for k in range(30, 40)]
@@ -610,7 +610,7 @@ def test_thumbnails_are_most_confident_of_each_category() -> None:
 
 
 def test_thumbnails_show_what_labels_say() -> None:
-    """They showed deleted and merged tracks, and renamed ones in the colour of the old category."""
+    """Deleted and merged tracks were shown, and renamed ones in the colour of the old category."""
     found = [("cup", 0.99), ("can", 0.6), ("can", 0.9), ("box", 0.5), ("can", 0.8)]
     ball = TrackLabel(3, "ball", 1.0)
     labels = {1: TrackLabel(1, "can", 0.6), 2: ball, 3: ball, 4: TrackLabel(4, "can", 0.8)}

@@ -92,7 +92,7 @@ def test_changed_tracking_settings_give_tables_of_new_run(
     ids=["nothing", "detection", "seed", "every", "color", "up"],
 )
 def test_options_that_affect_frames_process_them_again(job: Job, change: dict[str, Any]) -> None:
-    """`--overwrite` without any change must process them again, too."""
+    """`--overwrite` without any change must process the frames again, too."""
     with pytest.raises(PerceivedError):
         pipeline.process(replace(job, **change))
 
@@ -134,7 +134,7 @@ def test_unusable_tables_are_not_reused(job: Job, damage: Callable[[Path], None]
 def test_replaced_run_stays_complete_if_new_run_fails(
     job: Job, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its tables are hard links in the new folder, and must not be truncated there."""
+    """The old tables are hard links in the new folder, and must not be truncated there."""
     before = {name: untimed_table(job.folder, name) for name in TABLES}
 
     def fail(*_args: Any, **_options: Any) -> None:
@@ -249,7 +249,7 @@ def test_interrupted_run_keeps_its_frames_if_tracking_changes(
 
 
 def give_label(folder: Path, label: str) -> None:
-    """Give the first track a label, or none."""
+    """Set the label of track 1; an empty one removes it."""
     rows = [row for row in read_track_table(folder / "tracks.csv").rows if row.track == 1]
     assert len(rows) == 1
     lines = (folder / "tracks.csv").read_text("utf-8").splitlines()
@@ -349,7 +349,7 @@ def test_labels_given_until_the_run_is_replaced_are_transferred(
 def test_outputs_of_killed_annotation_are_completed_with_its_options(
     job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise they would have the old labels and boxes, and the old path of the recording."""
+    """Otherwise outputs would have the old labels and boxes, and the old path of the recording."""
     moved, written = tmp_path / "moved.mcap", []
     shutil.copyfile(job.source, moved)
     give_label(job.folder, "vase")

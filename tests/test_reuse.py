@@ -132,7 +132,7 @@ def test_only_moved_object_is_described_again() -> None:
     assert detection_at(world, perceptions, CHANGE + 1, place + shift).reused_from == CHANGE
     others = [d.reused_from for d in perceptions[CHANGE].detections if d is not moved]
     assert others.count(0) >= len(others) - 1
-    # A repeat must name the view that was described: naming a repeat, it would count twice.
+    # A repeat must name the view that was described; otherwise that view would count twice.
     assert perceptions[CHANGE + 1].reused_from == CHANGE
     again = [d.reused_from for d in perceptions[CHANGE + 1].detections]
     origins = [d.reused_from for d in perceptions[CHANGE].detections]
@@ -460,7 +460,7 @@ def test_nothing_is_reused_across_topics_or_up_directions() -> None:
 
 
 def test_interleaved_sensors_each_reuse_their_own_frames() -> None:
-    """Nothing would be reused on a robot with several cameras: it would take far longer."""
+    """With several cameras, nothing would be reused, and runs would take far longer."""
     left = replace(blank(), topic="/left")
     assert left.depth is not None
     right = replace(left, topic="/right", depth=left.depth[:, ::-1])
@@ -526,7 +526,7 @@ def test_same_scene_requires_known_and_equal_poses(
 def test_tables_record_reuse_within_each_block(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Blocks have fixed starts, so that any worker and any resumed run reuses the same."""
+    """Blocks have fixed starts, so that any worker and any resumed run reuses the same frames."""
     monkeypatch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
     source = record(still_world(10), tmp_path / "still.mcap", seed=1, sensor=KINECT)
     out = tmp_path / "out"

@@ -320,7 +320,7 @@ def test_path_of_track_joins_centres_of_whole_object(tmp_path: Path) -> None:
 
 
 def test_path_leaves_out_frame_without_pose(tmp_path: Path) -> None:
-    """Its positions, known only in the sensor frame, would be drawn at the origin of the map."""
+    """Positions that are known only in the sensor frame would be drawn at the origin of the map."""
     pose = Pose(Rotation.from_euler("zyx", [0.3, 0.2, -0.7]).as_matrix(), np.array([0.5, 0.1, 1.3]))
     scenes = [
         scene(k, [labelled_object(1, x=0.2 * k)], pose=None if k == 1 else pose) for k in range(3)
@@ -439,7 +439,7 @@ def test_few_rows_or_numbers_are_held_back(rows: int, size: int) -> None:
 
 
 def test_large_images_and_masks_are_not_held_back() -> None:
-    """If each counted as one row, 256 of them would be held in memory."""
+    """If each image counted as one row, 256 images would be held in memory."""
     sent: list[str] = []
     stream: Any = SimpleNamespace(
         log=lambda *_, **__: None, send_columns=lambda entity, *_: sent.append(entity)

@@ -51,7 +51,7 @@ def test_staged_folder_appears_complete(tmp_path: Path) -> None:
 def test_marker_of_a_cleared_folder_is_removed_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After a kill in between, shapecat would take the rest for files of someone else."""
+    """After a kill in between, shapecat would take the rest for somebody else's files."""
     for name in (*RUN_FILES, ".tracks.csv.partial", "notes.txt"):
         (tmp_path / name).write_text("")
     (tmp_path / "segments" / "000000").mkdir(parents=True)
@@ -189,7 +189,7 @@ def test_user_files_move_to_new_results(tmp_path: Path) -> None:
 
 
 def test_nothing_of_a_replaced_run_is_moved_to_the_new_one(tmp_path: Path) -> None:
-    """Its report would show old tracks and labels as if they belonged to the new run."""
+    """The old report would show old tracks and labels as if they belonged to the new run."""
     folder = make_run(tmp_path / "lab")
     for name in (
         *("frames.parquet", "detections.parquet", "planes.parquet", "masks.parquet"),
@@ -327,7 +327,7 @@ def test_name_too_long_for_hidden_folder_is_explained(tmp_path: Path, length: in
 
 
 def test_longest_name_of_a_recording_is_read(tmp_path: Path) -> None:
-    """The name of its write-ahead log is too long for the disk; looking for it was a traceback."""
+    """Its write-ahead log has a name too long for the disk; looking for it ended in a traceback."""
     path = tmp_path / ("n" * 250 + ".mcap")
     path.write_bytes(b"abc")
 

@@ -214,7 +214,7 @@ def test_consecutive_disturbed_frames_end_no_track(
 
 
 def test_up_of_tilted_fixed_frame_is_dropped(walk: Path, tmp_path: Path) -> None:
-    """Its z is not up, but its poses are right, and the planes agree on an up direction in it."""
+    """Its z axis is not up, but poses are right, and the planes agree on an up direction."""
     leaning = items(moving=True, fixed=LEANING, disturbed=DISTURBED)
     out = run(tmp_path / "leaning.mcap", leaning)
     about = read_run(out)
@@ -306,6 +306,7 @@ def tables(
 ) -> list[tuple[pa.Table, pa.Table]]:
     """Return frames and planes of one topic, in two parts; no plane where the offset is NaN.
 
+    ``up`` and ``given`` are (n, 3), ``rotation`` is (n, 3, 3), ``offsets`` is (n,), metres;
     ``every`` is the step between the numbers of the frames.
     """
     n = len(up)
@@ -329,7 +330,7 @@ def tables(
 
 
 def in_turn(one: Any, other: Any) -> list[tuple[pa.Table, pa.Table]]:
-    """Return tables with the alternating frames of two cameras, as they were recorded."""
+    """Return the rows of two results of `tables` in turn; the topic of ``other`` becomes /e."""
     return [
         tuple(
             pa.concat_tables([a, b.set_column(0, "topic", pa.array(["/e"] * len(b)))]).take(
@@ -430,7 +431,7 @@ def test_given_up_is_tested_for_each_camera(
 
 
 def test_nearby_frames_exclude_the_frame_itself() -> None:
-    """They are within three seconds, at most thirty on either side."""
+    """Nearby frames are those within three seconds, at most thirty on either side."""
     stream = _streams(tables(leaning(np.full(90, 35.0))))["/d"]
     apart = stream._replace(stamps_ns=np.arange(90) * 1_000_000_000)
 
@@ -518,7 +519,7 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 def look_again(revisions: dict[Any, Revision]) -> list[Any]:
-    """Return the rows and inputs of the chosen frames, three images fused into each."""
+    """Return the rows and inputs of the chosen frames, each fused from up to three images."""
     settings = Settings(detection=DetectionSettings(fuse_frames=3))
     work: Any = SimpleNamespace(run={"fixed_frame": None}, job=SimpleNamespace(settings=settings))
     return [*perceiving._views_again(work, revisions)]

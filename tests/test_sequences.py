@@ -13,7 +13,7 @@ from benchmarks import sequences
 
 
 def item(track: int, x: float, *, visible: float = 1.0, size: float = 0.1) -> dict[str, Any]:
-    """Return the truth of a cup in a frame."""
+    """Return the truth of a cup in a frame; ``visible`` is a fraction, lengths are in metres."""
     box = {"center": [x, 0.0, 1.0], "size": [size, size, size]}
     return {
         "track": track,
@@ -28,7 +28,7 @@ def item(track: int, x: float, *, visible: float = 1.0, size: float = 0.1) -> di
 
 
 def figures_of(folder: Path, objects: list[dict[str, Any]], tracks: list[list[float]]) -> Any:
-    """Return the figures of ten frames; ``tracks`` are the x of the tracks by frame, and repeat."""
+    """Return the metrics of ten frames; frame k has tracks at the x in tracks[k % len(tracks)]."""
     truth = [{"objects": objects, "hidden": []}] * 10
     (folder / "recording.truth.json").write_text(json.dumps(truth))
     rows = [

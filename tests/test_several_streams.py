@@ -74,7 +74,7 @@ def test_clocks_that_differ_are_reported(tmp_path: Path, ahead_s: float) -> None
 
 
 def test_without_fixed_frame_sensors_share_no_tracks(shapecat: Run, tmp_path: Path) -> None:
-    """Their coordinates are unrelated: different objects would be merged."""
+    """Coordinates of the sensors are unrelated: different objects would be merged."""
     recording = two_cameras(tmp_path / "a.mcap", transforms=False)
     options = ("--topic", DEPTH, "--topic", POINTS, "--no-rrd")
     assert shapecat("process", recording, "--out", tmp_path, *options).exit_code == 0

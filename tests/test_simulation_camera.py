@@ -312,7 +312,7 @@ def test_matching_windows_blend_only_small_steps(height: float, wide: tuple[int,
 
 
 def test_table_at_low_angle_has_no_missing_margins() -> None:
-    """Its inverse depth changes as much in a few pixels as at an outline, but there is none."""
+    """The inverse depth of the table changes as fast as at an outline, although there is none."""
     pose = looking_at(np.array([0, 0, 0.35]), np.array([0, 1.0, 0.2]))
     sensor = dataclasses.replace(PRESETS["d455"], holes=0.0, grazing_cosine=0.0, border_px=(0,) * 4)
     image = render(geometry([(big_quad(0.0), HERE)]), sensor.camera, pose)
@@ -325,7 +325,7 @@ def test_table_at_low_angle_has_no_missing_margins() -> None:
 
 @pytest.mark.parametrize("z", [0.5, 2.0])
 def test_time_of_flight_noise_grows_with_distance(z: float) -> None:
-    """With the noise of 1 m at 0.4 m, near objects would be rougher than real ones."""
+    """If noise were the same at 0.4 m as at 1 m, near objects would be rougher than real ones."""
     sensor = dataclasses.replace(PRESETS["l515"], fixed_error=0.0, holes=0.0)
     depth, _ = measure(wall_image(sensor, z), sensor, np.random.default_rng(0))
 

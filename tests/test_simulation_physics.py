@@ -25,7 +25,7 @@ from shapecat.types import Pose
 
 SETTLED: tuple[SceneKind, ...] = ("pile", "bin", "shelf_bin", "room")
 YAWED = rotation_from_quaternion([0, 0, np.sin(0.3), np.cos(0.3)])
-"""A rotation about the vertical that is no symmetry of a box."""
+"""A rotation about the vertical that is not a symmetry of a box."""
 
 
 @cache

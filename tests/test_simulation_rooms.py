@@ -36,7 +36,7 @@ def test_detections_on_background_and_fragments_are_counted() -> None:
 
 @pytest.mark.parametrize("kind", PROCEDURAL)
 def test_procedural_families_give_distinct_objects_of_table_size(kind: str) -> None:
-    """They train *unknown*, so they must fit on a table, and no two may be equal."""
+    """These objects train *unknown*, so they must fit on a table, and no two may be equal."""
     found = [make_distractor(np.random.default_rng(seed), kind)[1] for seed in range(30)]
     for mesh in found:
         assert 0.02 < mesh.extents.max() < 0.6

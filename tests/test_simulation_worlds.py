@@ -109,7 +109,7 @@ def world(request: pytest.FixtureRequest) -> World:
 
 
 def top_view(mesh: Mesh, pose: Pose) -> Bool:
-    """Return the cells of 3 mm that an object covers, rendered from far above."""
+    """Return whether an object, seen from far above, covers each cell (500, 500) of 3 mm."""
     far = 500.0
     camera = Camera(500, 500, far / 0.003, far / 0.003, 249.5, 249.5)
     above = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, far]))

@@ -265,7 +265,11 @@ def test_simd_adaptation_moves_only_winner_and_its_neighbours() -> None:
 
 
 def _fritzke(points: F4, state: int, target: int, signals: int, interval: int) -> NeuralGas:
-    """Run Algorithm 3 of the thesis step by step, with the deviations that the kernel states."""
+    """Run Algorithm 3 of the thesis step by step, with the deviations that the kernel states.
+
+    ``state`` seeds the order of the points; after each ``interval`` of the ``signals``, a neuron is
+    added, up to ``target``.
+    """
     places = [np.float64(points[0]), np.float64(points[1])]
     error, age = [0.0, 0.0], {frozenset((0, 1)): 0}
     order: list[int] = list(range(len(points)))
@@ -306,7 +310,7 @@ def _fritzke(points: F4, state: int, target: int, signals: int, interval: int) -
 
 
 def test_kernel_matches_published_algorithm() -> None:
-    """The kernel stores ages of edges, errors and rates in another form."""
+    """The kernel stores ages of edges, errors and rates in other forms, for the same result."""
     points = half_sphere(60, radius=1.0)
     gas = empty_gas(20)
     gas.x[:2], gas.y[:2], gas.z[:2] = points[:2].T

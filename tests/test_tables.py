@@ -94,7 +94,7 @@ def write_run_tables(folder: Path, counts: list[int], pose: Pose | None = None) 
 
 
 def test_tables_have_documented_columns(tmp_path: Path) -> None:
-    """Programs of users read these files."""
+    """Users' programs read these files."""
     write_run_tables(tmp_path, [3, 0, 2], Pose(np.eye(3), np.array([0, 0, 10])))
 
     table = pq.read_table(tmp_path / "detections.parquet")
@@ -177,7 +177,7 @@ def test_long_run_stays_in_the_order_of_the_recording(
 def test_second_look_without_result_does_not_replace_frame(
     tmp_path: Path,
 ) -> None:
-    """Another up direction may lose a scene; the first result is then better."""
+    """With another up direction, nothing may be found; the first result is then better."""
     write_run_tables(tmp_path, [2, 1, 0, 2])
     nothing = replace(perception(3, 0), scene=Scene(np.array([0, -1, 0]), (), ()))
     again = PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1", again=True)
@@ -357,7 +357,7 @@ def test_detections_keep_tracks_when_rows_are_read_in_parts(tmp_path: Path) -> N
     "change", [lambda rows: rows[1:], lambda rows: rows[::-1], lambda rows: rows[:0]]
 )
 def test_edited_detections_are_refused(tmp_path: Path, change: Callable[[Any], Any]) -> None:
-    """Boxes are found by row: a filtered or sorted table gave tracks the boxes of others."""
+    """Boxes are found by row: a filtered or sorted table gave tracks the boxes of other tracks."""
     write_run_tables(tmp_path, [2, 1])
     write_tracks(tmp_path, [(5, 0, 0), (6, 0, 1)])
     path = tmp_path / "detections.parquet"
@@ -381,7 +381,7 @@ def test_track_of_missing_detection_is_refused(tmp_path: Path) -> None:
 
 
 def test_masks_of_missing_frame_are_refused(tmp_path: Path) -> None:
-    """They ended in a RuntimeError, or an export wrote all later frames without masks."""
+    """Such masks caused a RuntimeError, or an export wrote all later frames without masks."""
     write_run_tables(tmp_path, [1, 1])
     write_tracks(tmp_path, [(5, 0, 0)])
     masks = ImageMasks("/rgb", 1000, 2000, "c", 40, 30, {0: (3, 4, 7, 9)}, {0: np.array([7])})

@@ -113,7 +113,10 @@ def frame_of(
     frame_id: str = "cam",
     offset: Pose | None = None,
 ) -> tuple[Perception, FrameRow]:
-    """Return a frame that the sensor takes at its k-th position; its number is k by default."""
+    """Return a frame that the sensor takes at its k-th position; its number is k by default.
+
+    ``origin`` is added to the position; ``offset`` is the pose of the sensor in ``frame_id``.
+    """
     up = ROTATIONS[k].inv().apply(UP)
     planes = (Plane(up, -0.5, OUTLINE, 0.7, 0.0), Plane(up, -0.2, OUTLINE + 1, 0.4, 0.3))
     index, stamp_ns = k if index is None else index, stamp(k) if stamp_ns is None else stamp_ns
@@ -276,7 +279,7 @@ def test_tracker_reads_which_views_are_reused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("flag", ["touches_border", "occluded"])
 def test_view_with_either_flag_counts_as_partial(tmp_path: Path, flag: str) -> None:
-    """A view of a half-hidden object would weigh as much as four of its kind."""
+    """Otherwise a view of a half-hidden object would weigh four times as much as it should."""
     frames = []
     for k in range(FRAMES):
         one = detection_of(k, 1)

@@ -63,7 +63,7 @@ def test_fragment_beside_object_does_not_take_its_identity() -> None:
 
 
 def test_new_object_beside_missed_one_starts_new_track() -> None:
-    """Unlimited assignment would give it to the track of the missed object at any cost."""
+    """Assignment without a limit would give it to the missed object's track at any cost."""
     tracker = Tracker(SETTINGS)
     for k in range(5):
         step(tracker, k, [[0, 0, 0], [1, 0, 0]])
@@ -155,7 +155,10 @@ def test_recording_may_have_one_frame_or_none() -> None:
 
 
 def cameras(count: int, *, frames: int, apart: float) -> list[FrameDetections]:
-    """Return the frames of cameras that take turns; each sees two objects of its own."""
+    """Return the frames of cameras that take turns; each sees two objects of its own.
+
+    The objects of one camera are ``apart`` metres from those of the next.
+    """
     random, stamp = np.random.default_rng(3), 0
     found = []
     for k in range(frames):
@@ -196,7 +199,7 @@ def test_frames_of_fast_camera_do_not_end_tracks_of_slow_one() -> None:
 
 @pytest.mark.parametrize("frames", [1, 2])
 def test_single_images_of_several_cameras_keep_every_detection(frames: int) -> None:
-    """Images of other cameras are no missed chance to confirm an object."""
+    """Images of other cameras must not count as missed chances to confirm an object."""
     found = cameras(3, frames=frames, apart=0.6)
     tracks = track_frames(found, SETTINGS, together={frame.topic for frame in found})
 
@@ -290,7 +293,7 @@ def test_short_gap_is_interpolated_and_long_gap_is_left_out() -> None:
 
 
 def test_track_ends_at_its_last_detection() -> None:
-    """The last position, and those in a gap before it, must not be an earlier one."""
+    """Otherwise the last position, and those in a gap before it, would repeat an earlier one."""
     frames = [frame(k, [] if 12 <= k < 15 else [[0.01 * k, 0, 0]]) for k in range(16)]
     (track,) = track_frames(frames, SETTINGS)
     assert track.detections[11:].tolist() == [0, -1, -1, -1, 0]
@@ -544,7 +547,7 @@ def test_objects_merged_by_one_sensor_stay_two_tracks() -> None:
 
 @pytest.mark.parametrize("count", [4, 8])
 def test_object_put_into_bowl_gets_own_track(count: int) -> None:
-    """Even if it is put there just before the end of the recording."""
+    """Objects that are added just before the recording ends must not be taken for pieces."""
     bowl, filled = [(0.0, 0.2)], [(0.0, 0.2), (0.1, 0.16)]
     tracks = tuple(track_frames(boxed([bowl] * 30 + [filled] * count), SETTINGS))
     assert sorted(track.hits for track in tracks) == [count, 30 + count]
@@ -566,14 +569,14 @@ def test_object_in_bowl_whose_size_varies_keeps_its_track() -> None:
 
 
 def test_object_put_onto_plate_on_tray_gets_own_track() -> None:
-    """Plate and tray enclosed its place only before it came; pieces are enclosed later, too."""
+    """Plate and tray enclose its place only in earlier frames, but that of a piece later, too."""
     empty = [(0.0, 0.4), (0.08, 0.26)]
     tracks = track_frames(boxed([empty] * 30 + [[*empty, (0.1, 0.16)]] * 8), SETTINGS)
     assert sorted(track.hits for track in tracks) == [8, 38, 38]
 
 
 def test_object_entering_view_in_fragments_is_one_track() -> None:
-    """Only its later size shows that they are fragments."""
+    """Only the later size of the object shows that the first detections are fragments."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.08), (0.08, 0.2)]
     tracks = tuple(track_frames(boxed([split] * 12 + [whole] * 30), SETTINGS))
     assert [track.hits for track in tracks] == [42]
@@ -604,7 +607,7 @@ def turning(*, speed: float, hidden: range, frames: int = 80) -> list[FrameDetec
 
 
 def test_hidden_object_on_turntable_keeps_its_track() -> None:
-    """The other objects show the rotation of the table: 1.2 rad, or 35 cm of its path."""
+    """Only the other objects show how far it moves: the table turns by 1.2 rad, which is 35 cm."""
     frames = turning(speed=0.4, hidden=range(25, 55))
     tracks = tuple(track_frames(frames, SETTINGS))
     assert sorted(track.hits for track in tracks) == [50, 80, 80, 80, 80]

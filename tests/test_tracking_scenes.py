@@ -32,7 +32,7 @@ class Object:
 
 @dataclass(frozen=True)
 class Sensor:
-    """The position of the camera, its view (a square around ``looks_at``), and its faults."""
+    """The position of the camera, its view (a square around ``looks_at``), and its fault rates."""
 
     eye: Callable[[float], F8]
     looks_at: Callable[[float], F8]

@@ -29,7 +29,7 @@ TURNED = Rotation.from_euler("zyx", [0.7, -0.4, 0.3]).as_matrix()
 
 
 def two_tracks(**changes: Any) -> tracker._Active:
-    """Return two tracks, one that moves; the variances are no multiples of each other."""
+    """Return two tracks, one that moves; the variances are not multiples of each other."""
     found = tracker._Active(
         ids=np.array([4, 9], np.int32),
         position=np.array([[0.11, -0.42, 0.83], [0.34, -0.15, 0.79]]),
@@ -101,7 +101,7 @@ def test_correction_is_kalman_update_with_running_means() -> None:
 
 
 def test_cost_of_pair_is_sum_of_differences() -> None:
-    """Squared distance over the gate, sizes, posteriors, and a penalty for young tracks."""
+    """It adds the squared distance in gates, sizes, posteriors, and a penalty for young tracks."""
     found = tracker._seed(
         np.array([[0.13, -0.40, 0.86], [0.34, -0.15, 0.60]]),
         np.log([[0.21, 0.10, 0.05], [0.31, 0.12, 0.05]]),
@@ -123,7 +123,7 @@ def test_cost_of_pair_is_sum_of_differences() -> None:
 
 
 def test_size_key_ignores_quarter_turn() -> None:
-    """The two sides swap; the height does not, though its length is between theirs."""
+    """The two sides swap; the height does not, although it is between the two."""
     expected = np.log([0.20, 0.06, 0.13])  # each a centimetre longer
 
     assert_allclose(size_key(np.array([[0.05, 0.19, 0.12], [0.19, 0.05, 0.12]])), [expected] * 2)
@@ -265,7 +265,7 @@ def test_partially_seen_object_may_be_larger(
 
 
 def test_frames_of_two_sensors_are_sorted_by_time() -> None:
-    """They are recorded one sensor after the other; each keeps its own order."""
+    """The sensors are recorded one after the other; the frames of each one stay in order."""
     order = [
         ("/a", 0, [0.1, 0.2]),
         ("/a", 3, [0.3]),

@@ -24,10 +24,10 @@ TOPIC = "/camera/depth/image_raw"
 
 
 class Clocks(NamedTuple):
-    """Stamp and log time (ns) of frame ``k``, of its image and of its transforms.
+    """Functions from frame number ``k`` to stamp and log time (ns) of its image and transforms.
 
-    The frame ``moves`` moves in ``odom``. ``later_s`` is added to the stamps of the transform from
-    ``map`` to ``odom``, which then moves, too.
+    The coordinate frame ``moves`` moves in ``odom``. ``later_s`` is added to the stamps of the
+    transform from ``map`` to ``odom``, which then moves, too.
     """
 
     images: Callable[[int], tuple[int, int]]

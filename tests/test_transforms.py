@@ -148,7 +148,7 @@ def published(
 
 @pytest.mark.parametrize("static", [False, True])
 def test_transform_is_unknown_within_a_gap(static: bool) -> None:
-    """Poses that were interpolated over 3 s were wrong by 10 cm; a static placeholder is, too."""
+    """Poses interpolated over 3 s were wrong by 10 cm; a static placeholder is wrong as well."""
     buffer = published(
         [*range(0, 301, 100), *range(1700, 2200, 100)], lambda t: moved(t * 1e-4), static=static
     )
@@ -252,7 +252,7 @@ def test_frame_may_change_its_parent() -> None:
 
 
 def test_each_transform_takes_little_memory() -> None:
-    """A hundred per second for ten hours and ten joints are 36 million."""
+    """A hundred per second, for ten joints and ten hours, are 36 million transforms."""
     buffer = TransformBuffer()
     tracemalloc.start()
     try:
@@ -435,7 +435,7 @@ def test_mixed_up_poses_of_two_robots_are_reported(tmp_path: Path) -> None:
 
 
 def test_transforms_without_stamps_use_log_times(tmp_path: Path) -> None:
-    """Images and accelerations without stamps use log times, too, and would find no transform."""
+    """Images without stamps use log times, too; otherwise they would find no transform."""
     items = [("/tf", EPOCH + k * SECOND, stamped("odom", "base", float(k), 0)) for k in range(3)]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         buffer = read_transforms(recording)

@@ -138,7 +138,7 @@ def test_cloud_without_one_viewpoint_stays_points(points: F4, tmp_path: Path) ->
 
 
 def test_viewpoint_is_found_again_after_it_moved(tmp_path: Path) -> None:
-    """A camera on an arm: the camera itself stays, its pose in the base does not."""
+    """A camera on an arm keeps its intrinsics, but not its pose in the base."""
     points = organized_points(wavy_depth())
     places = [(0.3, -1.2, 0.8), (0.3, -1.2, 0.8), (0.35, -1.1, 0.9)]
     items = [
@@ -157,7 +157,7 @@ def test_viewpoint_is_found_again_after_it_moved(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mount", [*MOUNTS, LINK])
 def test_cloud_in_other_frame_gives_the_results_of_its_camera(mount: str, tmp_path: Path) -> None:
-    """Transformed on the robot, its objects were split: the origin was mistaken for the camera."""
+    """Objects in transformed clouds were split: the origin was mistaken for the camera."""
     map_from_mounts = [
         MOUNTS.get(mount) or compose(view.pose, inverse(LINK_FROM_OPTICAL)) for view in views(2)
     ]
@@ -217,7 +217,7 @@ def test_cloud_in_the_map_needs_no_transforms(tmp_path: Path) -> None:
 
 
 def test_colour_camera_is_placed_beside_the_camera_of_a_moved_cloud(tmp_path: Path) -> None:
-    """Transforms relate it to the frame of the cloud, not to its camera: masks would be off."""
+    """Masks would be off: transforms relate it to the frame of the cloud, not the depth camera."""
     pose = Pose(rotation_from_quaternion((0.3, -0.6, 0.4, 0.5)), np.array([0.3, -1.2, 0.8]))
     beside = Pose(rotation_from_quaternion((0.1, 0.2, -0.1, 0.9)), np.array([0.05, -0.02, 0.01]))
     links = [("base_link", "color", compose(pose, beside))]

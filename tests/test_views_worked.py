@@ -147,7 +147,7 @@ def test_level_surface_counts_where_it_is() -> None:
 
 
 def test_surface_edges_do_not_cross_gaps() -> None:
-    """Otherwise the inside of a cup would be as near as its rim."""
+    """Otherwise opposite walls of a cup would be joined across the space between them."""
     points = walls()
     gas = gas_of(points)
     tree = cKDTree(points)
@@ -174,7 +174,7 @@ def test_separate_parts_are_linked_once_at_nearest_neurons() -> None:
 
 
 def test_stacked_object_is_described_relative_to_its_support() -> None:
-    """Relative to the table, it would begin too high, and its full box include the object below."""
+    """Relative to the table, it would begin too high; its box would include the object below."""
     shapes = [table(), box((0, 0, 0), (0.22, 0.18, 0.08)), box((0, 0.01, 0.08), (0.1, 0.08, 0.1))]
     frame = frame_of(render(shapes)[0])
     guesser: Any = Guesser()
