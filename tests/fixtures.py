@@ -54,13 +54,13 @@ PLANES = ("frame", "plane", "height_m", "area_m2", "normal", "offset")
 
 
 class Scene(NamedTuple):
-    """The contents of a recording; its images are ``shrunk`` times smaller than a Kinect's."""
+    """The contents of a recording; its images are ``downscale`` times smaller than a Kinect's."""
 
     kind: SceneKind
     container: FormatName
     frames: int
     seed: int
-    shrunk: int
+    downscale: int
     clouds: bool = False
     color: bool = False
 
@@ -87,7 +87,7 @@ def make_recordings(folder: Path) -> None:
             folder / name,
             format=scene.container,
             seed=scene.seed,
-            sensor=_shrunk(KINECT, scene.shrunk),
+            sensor=_downscaled(KINECT, scene.downscale),
             clouds=scene.clouds,
             color=scene.color,
             rate_hz=RATE_HZ,
@@ -152,7 +152,7 @@ def _agree(value: str, wanted: str) -> bool:
         return False
 
 
-def _shrunk(sensor: Sensor, k: int) -> Sensor:
+def _downscaled(sensor: Sensor, k: int) -> Sensor:
     c = sensor.camera
     focal = c.fx / k
     camera = Camera(c.width // k, c.height // k, focal, focal, c.cx / k, c.cy / k)

@@ -363,7 +363,7 @@ def bad_frames(path: Path) -> Path:
     return changed(path, change)
 
 
-def fox(path: Path, encoding: str) -> Path:
+def foxglove_clouds(path: Path, encoding: str) -> Path:
     """Write the table as Foxglove point clouds."""
     items = []
     for k, view in enumerate(back_and_forth(FRAMES)):
@@ -447,8 +447,8 @@ CASES: dict[str, Case] = {
     ),
     "mcap of ros 1": Case(ros1_mcap),
     "mcap with a hostile chunk": Case(hostile_chunk, reported="claims to hold"),
-    "foxglove json": Case(lambda p: fox(p, "json")),
-    "foxglove protobuf": Case(lambda p: fox(p, "protobuf")),
+    "foxglove json": Case(lambda p: foxglove_clouds(p, "json")),
+    "foxglove protobuf": Case(lambda p: foxglove_clouds(p, "protobuf")),
     "ros 1": Case(bag),
     **{
         f"ros 1 {c.name.lower()}": Case(partial(bag, compression=c))

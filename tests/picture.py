@@ -25,7 +25,7 @@ LAYERS = {
     1: "shared tools",
     0: "base",
 }
-MIDDLES = {
+CENTRES_X = {
     "api": 660,
     "batch": 740,
     "cli": 1100,
@@ -72,7 +72,7 @@ def box_positions(subpackages: set[str]) -> dict[str, _Position]:
         widths = [7.8 * len(name) + 12 for name in names]
         left = 120 + (WIDTH - 134 - sum(widths) - GAP * (len(names) - 1)) / 2
         for name, width in zip(names, widths, strict=True):
-            middle = MIDDLES.get(name, left + width / 2)
+            middle = CENTRES_X.get(name, left + width / 2)
             found[name] = (middle - width / 2, 16 + row * ROW + (ROW - BOX_H) / 2 - 6, width)
             left += width + GAP
     return found

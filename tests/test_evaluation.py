@@ -275,7 +275,7 @@ def test_folder_names_that_no_label_can_have_are_refused(
             train_on_folder(tmp_path / "data", tmp_path / "m.npz")
 
 
-def test_folder_with_decomposed_accents_is_told_from_its_category(tmp_path: Path) -> None:
+def test_folder_with_decomposed_accents_is_distinguished_from_its_category(tmp_path: Path) -> None:
     """On macOS, accents are decomposed: `does not know café (it knows café)` would help nobody.
 
     Nor would `there is also a folder café`, if there is one with composed accents.

@@ -139,7 +139,7 @@ def temporary_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return temporary
 
 
-def test_user_who_can_write_nowhere_uses_compiled_kernels(
+def test_user_without_writable_folder_uses_compiled_kernels(
     stage: Path, run: Run, temporary_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A container run as an arbitrary user compiled for a minute at each start."""

@@ -276,7 +276,7 @@ def test_objects_that_swap_places_are_distinguished_by_time(tmp_path: Path) -> N
     ("size", "other", "matched"),
     [(0.1, 0.1, False), (0.1, 0.21, True), (0.21, 0.1, True)],
 )
-def test_large_objects_are_matched_farther_at_once(
+def test_large_objects_are_matched_over_larger_distances_at_once(
     tmp_path: Path, size: float, other: float, *, matched: bool
 ) -> None:
     """Other settings may find another part of a box: up to half of its mean width is allowed."""
@@ -711,7 +711,7 @@ def test_table_alone_is_matched_by_positions(tmp_path: Path, place: str) -> None
 
 
 @pytest.mark.parametrize(("size", "label"), [(0.08, ""), (0.31, "mug")])
-def test_large_objects_are_matched_farther_to_table_alone(
+def test_large_objects_are_matched_over_larger_distances_to_table_alone(
     tmp_path: Path, size: float, label: str
 ) -> None:
     """The table has no sizes, but the run has them."""

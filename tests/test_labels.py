@@ -829,7 +829,7 @@ def test_table_with_an_endless_cell_is_refused(run: Path) -> None:
         read_labels(run / "tracks.csv")
 
 
-def test_new_category_of_many_tracks_is_compared_with_no_name(
+def test_new_category_of_many_tracks_is_not_compared_with_names(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With 2000 tracks and 200 new categories, reading the table took 27 s."""

@@ -311,7 +311,7 @@ def test_simultaneous_images_of_two_cameras_are_annotated(
     assert {frame.boxes for frame in frames} == {(ImageBox(6, "cup", 0.8, (3, 4, 7, 9)),)}
 
 
-def test_full_box_of_merged_object_holds_part_without_one() -> None:
+def test_full_box_of_merged_object_includes_part_without_full_box() -> None:
     """Otherwise the box would end where the full box of the other part does."""
     left, right = (labelled_object(6, box=box_at((x, 0.1, 1), (0.1, 0.2, 0.3))) for x in (0, 0.3))
     wide = box_at((-0.05, 0.1, 1.0), (0.2, 0.2, 0.4))
@@ -748,7 +748,9 @@ def test_export_of_other_time_range_is_not_replaced(
 
 
 @pytest.mark.parametrize("wrong", [{"range_s": 3}, {"range_s": ["a", 2]}, {"recordings": 3}])
-def test_marks_of_others_are_not_taken_for_exports(tmp_path: Path, wrong: Any) -> None:
+def test_export_json_of_other_programs_is_not_taken_for_an_export(
+    tmp_path: Path, wrong: Any
+) -> None:
     """An export.json that another program had made ended in a traceback."""
     (tmp_path / "export.json").write_text(json.dumps({**KITTI, "made": [], "objects": 3, **wrong}))
 

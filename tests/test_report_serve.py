@@ -103,7 +103,7 @@ def order_of(browser: Browser) -> list[int]:
     return [int(track) for track in browser.run(script)]
 
 
-def other_than(category: str, number: int) -> int:
+def key_of_other_category(category: str, number: int) -> int:
     """Return the digit key of a category other than ``category``; ``number`` varies the choice."""
     digit = 1 + number % len(NAMES)
     return digit if NAMES[digit - 1] != category else 1 + digit % len(NAMES)
@@ -116,7 +116,7 @@ def test_keyboard_corrections_survive_restart_of_server(browser: Browser, long_r
     with serving(long_run) as (address, _):
         browser.open(address)
         for number, track in enumerate(order_of(browser)):
-            digit = other_than(categories[track], number)
+            digit = key_of_other_category(categories[track], number)
             keys += [str(digit), "Right"]
             wanted[track] = NAMES[digit - 1]
         browser.press(*keys)

@@ -329,7 +329,7 @@ def tables(
     ]
 
 
-def in_turn(one: Any, other: Any) -> list[tuple[pa.Table, pa.Table]]:
+def interleaved(one: Any, other: Any) -> list[tuple[pa.Table, pa.Table]]:
     """Return the rows of two results of `tables` in turn; the topic of ``other`` becomes /e."""
     return [
         tuple(
@@ -377,7 +377,7 @@ def test_frames_are_compared_within_each_camera() -> None:
     one, other = (leaning(np.full(20, degrees)) for degrees in (35.0, 10.0))
     one[6], other[3] = leaning([80.0])[0], leaning([60.0])[0]
     shelf = np.where(np.arange(20) == 12, -0.9, -0.4)
-    both = in_turn(tables(one), tables(other, offsets=shelf, every=5))
+    both = interleaved(tables(one), tables(other, offsets=shelf, every=5))
 
     assert list(frames_to_revise(both)) == [("/d", 6), ("/e", 15), ("/e", 60)]
 
@@ -395,7 +395,7 @@ def test_rows_of_each_camera_are_read_apart() -> None:
         for _ in range(2)
     ]
     one, other = tables(**columns[0], every=3), tables(**columns[1], every=7)
-    streams = _streams(in_turn(one, other))
+    streams = _streams(interleaved(one, other))
 
     for topic, every, expected in zip(("/d", "/e"), (3, 7), columns, strict=True):
         found = streams[topic]

@@ -27,7 +27,7 @@ def item(track: int, x: float, *, visible: float = 1.0, size: float = 0.1) -> di
     }
 
 
-def figures_of(folder: Path, objects: list[dict[str, Any]], tracks: list[list[float]]) -> Any:
+def metrics_of(folder: Path, objects: list[dict[str, Any]], tracks: list[list[float]]) -> Any:
     """Return the metrics of ten frames; frame k has tracks at the x in tracks[k % len(tracks)]."""
     truth = [{"objects": objects, "hidden": []}] * 10
     (folder / "recording.truth.json").write_text(json.dumps(truth))
@@ -48,14 +48,14 @@ def test_false_track_lowers_mota_of_perfect_tracks(tmp_path: Path) -> None:
     objects = [item(0, 0.0), item(1, 0.5)]
     for name, tracks, mota in (("good", [[0.02, 0.5]], 1.0), ("more", [[0.0, 0.5, 0.9]], 0.5)):
         (tmp_path / name).mkdir()
-        assert figures_of(tmp_path / name, objects, tracks)["mota"] == mota
+        assert metrics_of(tmp_path / name, objects, tracks)["mota"] == mota
 
 
 def test_hidden_objects_are_ignored(tmp_path: Path) -> None:
     objects = [item(0, 0.0), item(1, 0.5, visible=0.2)]
     for name, tracks in (("kept", [[0.0, 0.5]]), ("left", [[0.0]])):
         (tmp_path / name).mkdir()
-        figures = figures_of(tmp_path / name, objects, tracks)
+        figures = metrics_of(tmp_path / name, objects, tracks)
         assert (figures["mota"], figures["idf1"], figures["objects"]) == (1.0, 1.0, 10)
 
 
@@ -63,18 +63,18 @@ def test_objects_and_tracks_out_of_range_are_ignored(tmp_path: Path) -> None:
     objects = [item(0, 0.0), item(1, 2.5)]
     for name, tracks in (("found", [[0.0, 2.5]]), ("left", [[0.0]]), ("invented", [[0.0, 3.5]])):
         (tmp_path / name).mkdir()
-        assert figures_of(tmp_path / name, objects, tracks)["mota"] == 1.0
+        assert metrics_of(tmp_path / name, objects, tracks)["mota"] == 1.0
 
 
 def test_large_object_matches_track_near_its_edge(tmp_path: Path) -> None:
     """Only the near part of a tray may be visible."""
     for name, size, mota in (("tray", 0.4, 1.0), ("cup", 0.1, -1.0)):
         (tmp_path / name).mkdir()
-        assert figures_of(tmp_path / name, [item(0, 0.0, size=size)], [[0.18]])["mota"] == mota
+        assert metrics_of(tmp_path / name, [item(0, 0.0, size=size)], [[0.18]])["mota"] == mota
 
 
 def test_swapped_identities_count_as_switches(tmp_path: Path) -> None:
-    figures = figures_of(tmp_path, [item(0, 0.0), item(1, 0.5)], [[0.0, 0.5], [0.5, 0.0]])
+    figures = metrics_of(tmp_path, [item(0, 0.0), item(1, 0.5)], [[0.0, 0.5], [0.5, 0.0]])
     assert figures["switches"] == 18
     assert figures["idf1"] == 0.5
 

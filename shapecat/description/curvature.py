@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shapecat.arrays import F4, I4
+from shapecat.arrays import F4, F8, I4
 from shapecat.jit import kernel
 
 __all__ = ["assign", "fit_surfaces"]
@@ -281,7 +281,7 @@ def _quadric(
 
 
 @kernel(fast=True, inline=True)
-def _solve(A: F4) -> None:
+def _solve(A: F8) -> None:
     """Solve a positive definite system in place (Cholesky).
 
     ``A`` (n, n + 1) holds the lower half of the matrix, and the right side, which becomes the

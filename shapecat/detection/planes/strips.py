@@ -88,7 +88,7 @@ def add_strip_planes(grid: DepthGrid, candidates: list[PlaneCandidate]) -> list[
             continue
         duplicates = [k for k in planes if abs(k.plane.offset - added.plane.offset) < STRIPS.same_m]
         if above > STRIPS.covers:
-            added = _covered(added, strips, grid.intrinsics)
+            added = _with_covered_area(added, strips, grid.intrinsics)
         if added.covered_m2 > 0:
             added = _widened(duplicates[0], added) if duplicates else added
         elif added.plane.area_m2 < max(
@@ -128,7 +128,7 @@ def _plane_at(grid: DepthGrid, strips: F4, up: F8, height: float) -> PlaneCandid
     return measure_candidate(grid, samples, horizontal_plane(grid.intrinsics, up, offset))
 
 
-def _covered(
+def _with_covered_area(
     candidate: PlaneCandidate, strips: F4, intrinsics: PinholeIntrinsics
 ) -> PlaneCandidate:
     """Return the candidate with its ``covered_m2``.

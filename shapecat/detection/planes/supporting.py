@@ -29,7 +29,7 @@ STEPS_DOWN = 20
 """Maximum number of steps down from the edge of a plane."""
 EDGE_CELLS = 2
 """Number of cells over which an edge is blurred."""
-MIN_BELOW = 20
+MIN_EVIDENCE = 20
 """Minimum number of samples below an edge, or around a plane, to decide what is there."""
 COUNT_STRIDE = 2
 """Step between the rows and columns of the samples that show whether something is on a plane."""
@@ -99,7 +99,7 @@ def _is_top(
     """
     furniture = area_m2 >= PLANES.furniture_m2
     on_wall, beyond = _count_below_edge(grid, inliers, plane, drop)
-    if on_wall + beyond >= MIN_BELOW:
+    if on_wall + beyond >= MIN_EVIDENCE:
         walled = on_wall > PLANES.wall_share * (on_wall + beyond)
         return walled and not (furniture and _count_above(grid, plane)[0] >= MIN_ABOVE)
     below_camera = plane.extent.min() > 0  # the camera cannot see the sides of the object
@@ -204,7 +204,7 @@ def _is_enclosed(grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane)
                 ahead = inv_depth[v, u] - (plane.a * u + plane.b * v + plane.c)
                 rises += ahead > 2 * PLANES.tolerance
                 drops += ahead < -2 * PLANES.tolerance
-    return rises >= MIN_BELOW and drops < PLANES.drop_ratio * rises
+    return rises >= MIN_EVIDENCE and drops < PLANES.drop_ratio * rises
 
 
 @kernel
