@@ -27,7 +27,7 @@ _SENSORS = (
     "phone",
 )
 _SUFFIXES: "dict[FormatName, str]" = {"mcap": ".mcap", "ros1": ".bag", "ros2": ""}
-"""Suffix by format. All three are repeated here, so that ``--help`` does not load the simulator."""
+"""Suffix by format. These three constants repeat the simulator's: ``--help`` must not load it."""
 
 
 @click.command()
@@ -105,7 +105,7 @@ def simulate(
     from shapecat.simulation.files import written_paths
 
     container = _format_of(out, container)
-    # Without --color too, colour labels of another scene must not remain.
+    # Even without --color, colour labels of another scene must not remain.
     there = [path for path in written_paths(out, container, color=True) if path.exists()]
     if there and not overwrite:
         msg = f"{there[0]} exists already; --overwrite replaces it"

@@ -282,7 +282,7 @@ def _checked(name: str, value: Any, kind: Any) -> Any:
             msg = f"{name} must be one of {', '.join(map(str, get_args(kind)))}, got {value!r}"
             raise ConfigError(msg)
         return value
-    if not isinstance(value, bool) and isinstance(value, Real):  # also numbers of numpy
+    if not isinstance(value, bool) and isinstance(value, Real):  # also NumPy scalars
         value = int(value) if isinstance(value, Integral) else float(value)
     if isinstance(value, int) and abs(value) > sys.float_info.max:
         msg = f"{name} is too large"

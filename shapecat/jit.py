@@ -162,8 +162,8 @@ def _temporary_folder() -> Path | None:
 def _keep_freed_memory() -> None:
     """Keep freed memory in the process: mapping it again costs 0.5 ms per frame.
 
-    glibc has two thresholds: larger blocks are mapped separately, and more free memory at the top
-    of the heap is returned. Freeing a large block raises both (mallopt(3), M_MMAP_THRESHOLD).
+    glibc maps blocks above M_MMAP_THRESHOLD separately, and returns free memory at the top of the
+    heap above M_TRIM_THRESHOLD. Freeing a large block raises both (mallopt(3)).
     """
     np.empty(_LARGE_BYTES, np.uint8)  # noqa: TID251  nothing is read
 

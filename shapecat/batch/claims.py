@@ -84,6 +84,8 @@ class Claim:
     def _is_stale(self, content: bytes, other: dict[str, Any]) -> bool:
         """Watch a claim; return True if it stays unchanged for 45 s, False if it disappears.
 
+        ``content`` is the claim as it was read, ``other`` its fields.
+
         Raises
         ------
         OutputError : the claim changes, so its owner is alive.

@@ -239,7 +239,7 @@ class Location:
                 yield self._url_of(info), info
 
     def matches(self) -> Iterator[tuple[str, Mapping[str, Any]]]:
-        """Yield URL and info of the files that match this URL, which is a pattern."""
+        """Yield URL and info of the files and folders that match this URL, which is a pattern."""
         infos = self._retry("listed", lambda: self._system.glob(self._path, detail=True))
         for info in infos.values():
             yield self._url_of(info), info

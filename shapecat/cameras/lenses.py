@@ -88,7 +88,7 @@ def undistorted_rays(camera: Camera, model: str, coefficients: Sequence[float]) 
 
 
 def _polynomial(rays: F8, d: F8) -> F8:
-    """Apply Brown's radial and tangential distortion; k4 to k6 are the rational part."""
+    """Distort rays (..., 2) by Brown's model in its rational form, with coefficients ``d`` (8,)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = d
     x, y = rays[..., 0], rays[..., 1]
     r = x * x + y * y
@@ -103,7 +103,7 @@ def _polynomial(rays: F8, d: F8) -> F8:
 
 
 def _fisheye(rays: F8, d: F8) -> F8:
-    """Apply Kannala and Brandt's equidistant model."""
+    """Distort rays (..., 2) by Kannala and Brandt's model, with the first four of ``d`` (8,)."""
     radius = np.maximum(np.hypot(rays[..., 0], rays[..., 1]), 1e-12)
     angle = np.arctan(radius)
     s = angle * angle

@@ -13,7 +13,7 @@ THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "
 
 
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")
-"""CPU time that a container may use in each period, and the period, microseconds."""
+"""File with the CPU time that a container may use per period, and the period, microseconds."""
 
 
 def usable_cores() -> int:

@@ -26,8 +26,8 @@ _ITEMS_BEFORE_START = 1
 _SENT_AHEAD = 1
 """Items sent to a busy process in advance."""
 _MOST_PER_PROCESS = 3
-"""Most items per other process: the one it works on, one sent in advance, and one waiting here. A
-thread sends that one as soon as there is room, even while this process works."""
+"""Maximum number of items per other process: the one it works on, one sent in advance, and one
+waiting here. A thread sends it as soon as there is room, even while this process works."""
 _MOST_PENDING = 8
 """At most this many items are in progress, or wait for the result of an earlier one."""
 _SWITCH_S = 5e-4

@@ -227,7 +227,7 @@ def _rank(one: ColourStream, stream: Stream) -> tuple[bool, int, bool, bool, int
 
 
 def _is_in_frame_of(one: ColourStream, stream: Stream) -> bool:
-    """Return whether the images are in the sensor frame of a depth stream; not if it has no id."""
+    """Return whether images are in the sensor frame of a depth stream; False without a frame id."""
     return one.frame_id != "" and same_frame(one.frame_id, stream.frame_id)
 
 

@@ -140,7 +140,7 @@ def sample_pixels(points: F4, valid: Callable[[F4], Bool]) -> tuple[F8, F8, F8] 
 
 
 def _medians(a: F8, b: F8) -> tuple[F8, F8]:
-    """Return the medians of ``a`` and ``b`` in 16 bins of ``b``. Outliers hardly move medians."""
+    """Return the medians (16,) of ``a`` and ``b`` (n,) in 16 bins of ``b``, robust to outliers."""
     groups = np.array_split(np.argsort(b, kind="stable"), 16)
     return (
         np.array([np.median(a[group]) for group in groups]),

@@ -18,7 +18,7 @@ _NEAR = 0.01
 _EQUAL = 1e-6
 """Intrinsics that differ by less than this fraction of the image width are equal."""
 _UNDISTORTED_PX = 2.0
-"""Images are treated as registered if the lens moves each pixel by less than this."""
+"""A lens is nearly undistorted if it images the ray of each pixel less than this from the pixel."""
 _STEPS = 9
 """Rows and columns of the grid of pixels at which lens distortion is computed."""
 
@@ -34,9 +34,9 @@ def are_equal(lens: LensCamera, camera: Camera | None) -> bool:
 
 
 def is_nearly_undistorted(lens: LensCamera, camera: Camera | None) -> bool:
-    """Return whether a lens moves each pixel of a pinhole camera by less than 2 pixels.
+    """Return whether a lens images the ray of each pixel less than 2 pixels from that pixel.
 
-    The result is True if the lens has no distortion, or if ``camera`` is None.
+    The pixels are those of ``camera``. The result is True without a camera or without distortion.
     """
     return _bend_px(lens, camera) < _UNDISTORTED_PX
 
@@ -52,7 +52,7 @@ def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> boo
 
 @lru_cache(maxsize=8)
 def _bend_px(lens: LensCamera, camera: Camera | None) -> float:
-    """Return by how many pixels, in x or y, the lens moves a pixel of ``camera`` at most."""
+    """Return the largest distance, in x or y, from a pixel to where the lens images its ray."""
     if camera is None or not lens.model:
         return 0.0
     pinhole = lens.pinhole

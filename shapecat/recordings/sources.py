@@ -165,7 +165,7 @@ class DepthSource(FrameSource):
             self._info, self._info_stamp = info, stamp
 
     def read(self, message: Message, index: int) -> Iterator[Frame]:
-        """Yield the frame of the previous image, and that of this one if its calibration came."""
+        """Yield the frame of the previous image, and of this one if its calibration came first."""
         yield from self.finish()
         with self.counting():
             image = self.recording.decode(message)

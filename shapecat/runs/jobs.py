@@ -215,7 +215,7 @@ def add_warnings(run: RunInfo, warnings: Iterable[str]) -> None:
 
 
 def identify(run: RunInfo, content: ContentDigest) -> None:
-    """Set the digest of the input and the ``work`` id of a run, in place.
+    """Set the ``work`` id of a run, and the digest of its input if it has none, in place.
 
     Raises
     ------

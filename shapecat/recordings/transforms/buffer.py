@@ -66,7 +66,7 @@ class TransformLoopError(TransformError):
 
 
 class TransformBuffer:
-    """Transforms between frames. A static transform is valid when there is no other one."""
+    """Transforms between frames; static ones are valid when their child frame has no other."""
 
     def __init__(self) -> None:
         """Make an empty buffer."""
@@ -100,7 +100,8 @@ class TransformBuffer:
         Parameters
         ----------
         parent_from_child : translation (x, y, z) in metres and quaternion (x, y, z, w).
-        static : whether it is valid whenever there is no other one; ``stamp_ns`` is then ignored.
+        static : whether it is valid whenever ``child`` has no other transform; ``stamp_ns`` is then
+            ignored.
         latched : whether it is valid until the next one, however late that is.
         log_time_ns : its log time; None if it is unknown.
 
@@ -111,7 +112,7 @@ class TransformBuffer:
         quaternion is zero.
         """
         parent, child = parent.strip().lstrip("/"), child.strip().lstrip("/")
-        # With Numpy, this would take most of the reading time: joints publish at 1 kHz.
+        # With NumPy, this would take most of the reading time: joints publish at 1 kHz.
         x, y, z = map(float, parent_from_child[0])
         quaternion = tuple(map(float, parent_from_child[1]))
         norm = math.hypot(*quaternion)

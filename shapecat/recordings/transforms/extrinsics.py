@@ -110,7 +110,7 @@ class Extrinsics:
         return sorted(around, key=len, reverse=True) or (list(names) if len(names) == 1 else [])
 
     def _recorder_pose(self, image: str) -> Pose | None:
-        """Return ``stream_from_reference`` as librealsense's recorder wrote it; None if absent."""
+        """Return ``stream_from_reference`` of an image topic from librealsense; None if absent."""
         prefix = f"{image.rpartition('/image')[0]}/tf/"
         for topic in self._recording.topics:
             if topic.name.startswith(prefix) and len(prefix) > 4:

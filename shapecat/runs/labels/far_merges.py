@@ -63,7 +63,7 @@ def far_merges(folder: Path, labels: Mapping[int, TrackLabel]) -> list[Gap]:
 
 
 def _read_gaps(folder: Path, objects: Mapping[int, int]) -> list[Gap]:
-    """Return the gap between each two tracks of the same object that have common frames.
+    """Return the gap between every two tracks of one object that have common frames.
 
     ``objects`` maps each track to the number of its object.
     """
@@ -82,9 +82,9 @@ def _read_gaps(folder: Path, objects: Mapping[int, int]) -> list[Gap]:
 
 
 def _distances(boxes: Sequence[AnnotationBox]) -> F8:
-    """Return the distance (n, n) between each two boxes along the face normal that shows most.
+    """Return the largest gap (n, n) between every two boxes along a face normal of either.
 
-    It is 0 if no face normal of the two separates them, and never more than their true distance.
+    It is 0 if no face normal separates them, and never more than their true distance.
     """
     centers = np.array([box.center for box in boxes])
     halves = np.array([box.size for box in boxes]) / 2

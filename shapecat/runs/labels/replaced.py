@@ -89,7 +89,7 @@ def forget_old_labels(folder: Path, run: RunInfo, job: Job) -> None:
 def keep_last_labels(folder: Path, run: RunInfo, job: Job) -> None:
     """Transfer labels that the replaced results have been given since `keep_labels`, if any.
 
-    They are written to tracks.csv alone, as those that a report page writes.
+    The outputs do not show them yet, as with labels from a report page.
 
     Raises
     ------

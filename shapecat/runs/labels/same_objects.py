@@ -60,7 +60,7 @@ class Matches:
 def match_in_time(source: Path, target: Path, group: Group) -> Matches | None:
     """Match tracks that are mutual nearest neighbours in most of the frames that both runs have.
 
-    The result is None if the runs have no frames in common.
+    The result is None if both runs have tracks, but no frames in common.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def _by_majority(
     """Match each track of the target with the source object that it matches in most frames.
 
     ``votes`` counts, for each pair of source and target track, the frames in which they match, and
-    ``apart`` sums their distances, metres; ``counts`` are the frames of each target track.
+    ``apart`` sums their distances, metres; ``counts`` counts the frames of each target track.
     """
     matches_of: dict[int, list[Match]] = {}
     reasons: dict[int, str] = {}

@@ -244,8 +244,8 @@ def _translate(
 ) -> tuple[tuple[Transferred, ...], tuple[Missed, ...]]:
     """Return the labels for tracks of the target, and the labels that match no track.
 
-    A *whole* is a track that others were merged with. Its label is copied to its matches. If the
-    others have labels to transfer, all matches are one object: they are merged with the first.
+    A *whole* is a track with which others, its parts, were merged. Its label is copied to its
+    matches. If it has parts, its other matches and theirs are merged with its first match.
     """
     transferred: dict[int, Transferred] = {}
     missed = []

@@ -23,8 +23,8 @@ _FAR_S = 0.25
 _SHIFT_M = 0.01
 """Masks are displaced if objects move farther than this between the two images."""
 _UNEXPLAINED = 0.5
-"""Poses explain the motion of objects relative to the camera if, in the fixed frame, objects move
-less than this many times as far: their visible sides change, so that they never seem at rest."""
+"""Poses explain the motion of objects relative to the camera if this fraction of it exceeds their
+motion in the fixed frame. They never seem at rest there, since their visible sides change."""
 _MIN_MOTIONS = 3
 """Minimum number of comparisons on which the speed of objects is based."""
 

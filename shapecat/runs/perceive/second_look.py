@@ -143,9 +143,9 @@ def _around(stream: _Stream, k: int) -> I4:
 
 
 def _other_support(stream: _Stream, off: Bool) -> Bool:
-    """Return whether each frame (n,) lacks a plane where the frames around it have their lowest.
+    """Return whether each frame (n,) has no plane at the height of its neighbours' lowest planes.
 
-    It does not if the frames around it disagree. ``off`` (n,) marks frames that are ignored.
+    The result is False where these disagree or are too few. ``off`` (n,) marks frames to ignore.
     """
     is_other = np.zeros(len(off), np.bool_)
     for k in np.flatnonzero(~off):

@@ -58,7 +58,7 @@ class DetectedFrames:
         return np.asarray(rows - self.first[self._find(rows)])
 
     def _find(self, rows: I4) -> I4:
-        """Return the rows (n,), in the frames table, of the frames of detections ``rows`` (n,)."""
+        """Return the indices (n,) in ``first`` for detections, given their table rows (n,)."""
         return np.asarray(np.searchsorted(self.first, rows, side="right") - 1)
 
 
