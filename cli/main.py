@@ -1,4 +1,4 @@
-"""The entry point: the group of commands; it prints a known error as a single line."""
+"""The entry point: a group of commands that prints a known error as a single line."""
 
 import errno
 import logging

@@ -272,7 +272,7 @@ def level_points(frame: Frame, scene: Scene, candidate: Candidate) -> tuple[F8, 
 
 
 def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:
-    """Return a generator seeded by (seed, stamp, ``item``): 0 for the frame, k + 1 for object k."""
+    """Return a generator seeded by seed, stamp and ``item``: an object's number from 1, else 0."""
     return np.random.default_rng((settings.seed, abs(frame.stamp_ns), item))
 
 

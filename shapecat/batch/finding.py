@@ -77,7 +77,7 @@ def find_recordings(sources: Sequence[str]) -> SearchResult:
 def _expanded(source: str) -> list[Path]:
     """Expand a pattern, unless a file has this name or nothing matches.
 
-    A match in a folder that matches, too, is left out: the search of the folder finds it.
+    A match inside a matching folder is left out: the search of the folder finds it.
     """
     if os.path.lexists(source):
         return [Path(source)]

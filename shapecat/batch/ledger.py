@@ -55,7 +55,7 @@ class Ledger:
         return None if self._manifest is None else self._manifest.entries.get(folder)
 
     def _is_recorded(self, entry: Entry, state: State) -> bool:
-        """Return whether the last entry of the folder has this state, input, work and command."""
+        """Return whether the folder's last entry has this state and the command of ``entry``."""
         last = self._last_entry(entry.folder)
         return last is not None and last.state == state and last.same_command(entry)
 

@@ -100,7 +100,7 @@ class Task:
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """Return the index and the number of shards of ``I/N``; I may count from 0 or from 1.
+    """Return the index of a shard ``I/N``, from 0, and N; I may count from 0 or from 1.
 
     Raises
     ------

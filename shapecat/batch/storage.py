@@ -173,7 +173,7 @@ class Location:
         self._put("uploaded", lambda: self._system.put_file(str(file), self._path, **options))
 
     def _in_parts(self, size: int = 0) -> dict[str, int]:
-        """Return options that limit the memory of a transfer; S3's default is half a gigabyte."""
+        """Return options that limit the memory to send ``size`` bytes; S3's default is 0.5 GB."""
         part = max(_PART_BYTES, -(-size // _MOST_PARTS))
         return {"chunksize": part, "max_concurrency": 2} if self._is_s3() else {}
 

@@ -31,7 +31,7 @@ _LOST = {
     *("WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"),  # Ray
 }
 _DROPPED = {"CancelledError", "FutureCancelledError", "CommClosedError"}
-"""Errors that mean a lost worker, and a lost scheduler, by name: Dask and Ray may be missing."""
+"""Names of errors that mean a lost worker, and a lost scheduler; Dask and Ray may be missing."""
 
 
 def open_executor(name: str, *, workers: int, address: str | None = None) -> WorkerExecutor:

@@ -120,7 +120,7 @@ def _are_from_two_instances(a: Stream, b: Stream, first: _Place, second: _Place)
     """Return whether two streams seem to be from two instances of a driver, in two namespaces.
 
     Their topics are then the same after the namespace, but have different calibrations. Clouds have
-    no calibration, so the last two components of their topics are compared instead. Two namespaces
+    no calibration; instead, the last two components of their topics must agree. Two namespaces
     with the same first component (``/kinect2/hd``, ``/kinect2/qhd``) belong to one driver. If one
     namespace ends with the other, it holds a copy, such as throttled topics.
     """

@@ -73,7 +73,7 @@ class Extrinsics:
     def _lookup(
         self, buffer: TransformBuffer, depth_frame: str, colour_frame: str, stamp_ns: int
     ) -> Pose | None:
-        """Look up a transform; None if it is missing."""
+        """Return ``colour_from_depth`` from ``buffer``; None if it is missing."""
         with suppress(TransformError):
             try:
                 return buffer.lookup(colour_frame, depth_frame, stamp_ns)

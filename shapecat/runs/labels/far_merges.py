@@ -20,9 +20,9 @@ _FAR_M = 0.05
 
 
 class Gap(NamedTuple):
-    """The gap between two tracks, the lower number first: its mean over ``frames`` common frames.
+    """The mean gap between two tracks, the lower number first, over ``frames`` common frames.
 
-    It is the distance between their full boxes, or visible ones where full boxes are unknown.
+    A gap is the distance between their full boxes, or visible ones where full boxes are unknown.
     """
 
     tracks: tuple[int, int]

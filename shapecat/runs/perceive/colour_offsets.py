@@ -35,7 +35,7 @@ class _Stream:
 
     Attributes
     ----------
-    offsets_s : for each frame, the time between its two images, seconds.
+    offsets_s : time between depth and colour image, seconds, for each frame that has both.
     speeds : speeds of objects relative to the camera, m/s; 0 if poses explain the motion.
     compared : the last compared frame.
     """
