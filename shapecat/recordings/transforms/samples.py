@@ -59,7 +59,7 @@ class TransformTrack:
         with about the same stamps.
     delays : log time minus stamp of the messages, in their order in the recording.
     latched : whether the last transform remains valid for ever.
-    moves : whether a sample is not close to the first one; see `_MOVED_M`.
+    moves : whether a sample whose delay was kept is not close to the first one; see `_MOVED_M`.
     static : the static transform, valid when no other one is; None if there is none.
     stamps : stamps of the samples, nanoseconds.
     """
@@ -126,7 +126,7 @@ class TransformTrack:
             self._set(slice(at, at), stamp, sample)
 
     def note(self, log_time_ns: int, stamp_ns: int, sample: TransformSample) -> None:
-        """Add the delay of a sample, and update ``moves``."""
+        """Add the delay of a sample; if the delay is kept, update ``moves``."""
         if self.delays.add(log_time_ns, stamp_ns) and not self.moves:
             self._first = self._first or sample
             self.moves = not are_close(self._first, sample)
