@@ -23,7 +23,7 @@ from shapecat.recordings.pinhole import (
     is_rectified,
 )
 from shapecat.recordings.recording import Recording
-from shapecat.recordings.registration import are_equal, are_similar, is_nearly_undistorted
+from shapecat.recordings.registration import are_equal, are_similar, is_nearly_aligned
 from shapecat.recordings.sensors import is_of_realsense_recorder, same_frame
 from shapecat.recordings.stamps import Clock, stamp_ns
 from shapecat.recordings.streams import Stream
@@ -270,7 +270,7 @@ class _Partner:
             raise MessageError(msg)
         named = not is_of_realsense_recorder(self.stream.topic)
         one_frame = named and same_frame(image.frame_id, frame.frame_id)
-        undistorted = lens is None or is_nearly_undistorted(lens, frame.camera)
+        undistorted = lens is None or is_nearly_aligned(lens, frame.camera)
         alike = lens is None or (undistorted and are_similar(lens, frame.camera))
         if same_shape and one_frame and alike:
             return ColourView(image, lens or _lens(frame.camera))

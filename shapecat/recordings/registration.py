@@ -11,7 +11,7 @@ from shapecat.cameras.colour import LensCamera
 from shapecat.cameras.lenses import distort
 from shapecat.types import Camera
 
-__all__ = ["are_equal", "are_similar", "is_nearly_undistorted"]
+__all__ = ["are_equal", "are_similar", "is_nearly_aligned"]
 
 _NEAR = 0.01
 """Intrinsics that differ by less than this fraction of the image width are similar."""
@@ -33,12 +33,12 @@ def are_equal(lens: LensCamera, camera: Camera | None) -> bool:
     return _are_within(lens, camera, _EQUAL)
 
 
-def is_nearly_undistorted(lens: LensCamera, camera: Camera | None) -> bool:
+def is_nearly_aligned(lens: LensCamera, camera: Camera | None) -> bool:
     """Return whether a lens images the ray of each pixel less than 2 pixels from that pixel.
 
     The pixels are those of ``camera``. The result is True without a camera or without distortion.
     """
-    return _bend_px(lens, camera) < _UNDISTORTED_PX
+    return _largest_offset_px(lens, camera) < _UNDISTORTED_PX
 
 
 def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> bool:
@@ -51,7 +51,7 @@ def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> boo
 
 
 @lru_cache(maxsize=8)
-def _bend_px(lens: LensCamera, camera: Camera | None) -> float:
+def _largest_offset_px(lens: LensCamera, camera: Camera | None) -> float:
     """Return the largest distance, in x or y, from a pixel to where the lens images its ray."""
     if camera is None or not lens.model:
         return 0.0

@@ -105,7 +105,7 @@ class FullBoxes:
                 self._write_in_views(fused, sighting, part)
         return result
 
-    def _sightings(self, tracks: Sequence[Track]) -> "list[_Sighting]":
+    def _sightings(self, tracks: Sequence[Track]) -> "list[_TrackViews]":
         """Return, for each track, its detections that have a full box."""
         detected = [np.flatnonzero(track.detections >= 0) for track in tracks]
         rows = [track.detections[at] for track, at in zip(tracks, detected, strict=True)]
@@ -113,10 +113,12 @@ class FullBoxes:
         for at, of_track, boxes in zip(detected, rows, self._read(rows, _BOXES), strict=True):
             known = ~np.isnan(boxes[:, 0])
             partial = boxes[known, BOX_WIDTH] > 0
-            result.append(_Sighting(at[known], of_track[known], boxes[known, :BOX_WIDTH], partial))
+            result.append(
+                _TrackViews(at[known], of_track[known], boxes[known, :BOX_WIDTH], partial)
+            )
         return result
 
-    def _views(self, sighting: "_Sighting", picked: I4, details: F4) -> BoxViews:
+    def _views(self, sighting: "_TrackViews", picked: I4, details: F4) -> BoxViews:
         """Return the views with the indices ``picked`` (k,) of a track, in the fixed frame.
 
         ``details`` are their values of `_DETAILS` (k, 3 + `DIRECTIONS`).
@@ -126,7 +128,7 @@ class FullBoxes:
         sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)
         return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
 
-    def _write_in_views(self, fused: FusedBox, sighting: "_Sighting", result: F4) -> None:
+    def _write_in_views(self, fused: FusedBox, sighting: "_TrackViews", result: F4) -> None:
         """Write the fused box of a track to ``result``, in the sensor frame of each of its views.
 
         ``result`` (frames, 13) holds the rows of the track in `of_tracks`.
@@ -151,7 +153,7 @@ class FullBoxes:
         return _split(result, list(map(len, rows)))
 
 
-class _Sighting(NamedTuple):
+class _TrackViews(NamedTuple):
     """The views of a track that have a full box.
 
     Attributes

@@ -21,17 +21,17 @@ def as_ros(kind: str, message: Any) -> Any:
 
     Messages of other types are returned unchanged. Byte fields may be base64 text, as in JSON.
     """
-    counterpart = _COUNTERPARTS.get(_plain(kind))
+    counterpart = _COUNTERPARTS.get(_foxglove_name(kind))
     return message if counterpart is None else counterpart[1](message)
 
 
 def ros_counterpart(kind: str) -> str:
     """Return the ROS type that corresponds to a Foxglove type; any other type unchanged."""
-    counterpart = _COUNTERPARTS.get(_plain(kind))
+    counterpart = _COUNTERPARTS.get(_foxglove_name(kind))
     return kind if counterpart is None else counterpart[0]
 
 
-def _plain(kind: str) -> str:
+def _foxglove_name(kind: str) -> str:
     """Return a Foxglove type's name in JSON and protobuf; ``kind`` may also be its ROS name."""
     return kind.replace("foxglove_msgs/msg/", "foxglove.")
 

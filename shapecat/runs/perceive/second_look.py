@@ -100,7 +100,7 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
         posed = np.isfinite(stream.rotation[:, 0, 0])
         expected = _fixed_up(stream, posed) if 2 * posed.sum() > len(posed) else _still_up(stream)
         off = ~stream.has_plane | ~(_cosine(stream.up, expected) > _cos(_OFF_DEG))
-        off |= ~posed & _other_support(stream, off)
+        off |= ~posed & _lacks_usual_support(stream, off)
         agrees = _cosine(stream.given, expected) > _cos(_AGREES_DEG)
         for k in np.flatnonzero(np.isfinite(expected[:, 0]) & off & ~agrees):
             hint = stream.given[k].astype(np.float32) if np.isfinite(stream.given[k, 0]) else None
@@ -142,7 +142,7 @@ def _around(stream: _Stream, k: int) -> I4:
     return np.asarray(rows[soon & (rows != k)])
 
 
-def _other_support(stream: _Stream, off: Bool) -> Bool:
+def _lacks_usual_support(stream: _Stream, off: Bool) -> Bool:
     """Return whether each frame (n,) has no plane at the height of its neighbours' lowest planes.
 
     The result is False where these disagree or are too few. ``off`` (n,) marks frames to ignore.
