@@ -41,7 +41,7 @@ def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str
 
     Raises
     ------
-    OutputError : the run has no such frame, or has it on several topics.
+    OutputError : the run has no such frame, has it on several topics, or is damaged.
     """
     finished = read_finished(folder)
     topic = _topic(folder, frame, topic)

@@ -17,7 +17,7 @@ _LONGEST_BYTES = 120
 def caption(track: int, category: str, confidence: float) -> str:
     """Return the text beside an object: track, category and confidence.
 
-    The text of an unknown object omits the confidence. It is that of the most probable category,
+    The text of an unknown object omits the confidence, which is that of the most probable category
     but would be read as the certainty that the object is unknown.
 
     Examples

@@ -153,7 +153,7 @@ ENCODINGS: dict[str, Callable[[], _Encoding]] = {
     "json": _json,
     "protobuf": _protobuf,
 }
-"""A function that makes each encoding, by its name.
+"""For each encoding, the function that makes it.
 
 Annotations have the encoding of the recording: ROS tools fail on a file with mixed encodings.
 """

@@ -223,7 +223,7 @@ class Appender:
         )
 
     def _flush(self, waiting: int) -> None:
-        """Submit the chunk if it has messages; wait until at most ``waiting`` are unwritten."""
+        """Submit the chunk if it has messages; wait until ``waiting`` or fewer chunks are left."""
         if self._chunk.entries:
             self._waiting.append(self._writer.submit(self._write_chunk, self._chunk))
             self._chunk = _Chunk()

@@ -242,7 +242,7 @@ def _staged(target: Path, about: Mapping[str, Any], write: Callable[[Path], int]
 
 
 def _mark(folder: Path, about: Mapping[str, Any]) -> None:
-    """Write export.json, the marker of an export, with ``about`` and the names in ``folder``."""
+    """Write export.json, which marks an export: its description ``about``, and the names in it."""
     names = sorted(path.name for path in folder.iterdir() if path.name != _MARK)
     with replacing(folder / _MARK) as path:
         path.write_text(json.dumps({**about, "made": names}, indent=1) + "\n", "utf-8")
@@ -272,7 +272,7 @@ def _made_by_export(folder: Path) -> Collection[str] | None:
 
 
 def _tracked(frames: Iterable[LabelledFrame], placed: Collection[str]) -> Iterator[LabelledFrame]:
-    """Leave out frames without a pose on ``placed``, the topics tracked in the fixed frame."""
+    """Of the topics ``placed``, tracked in the fixed frame, leave out the frames without a pose."""
     return (f for f in frames if f.fixed_from_sensor is not None or f.topic not in placed)
 
 

@@ -86,7 +86,8 @@ def _shaded(
 ) -> U4:
     """Return the colours (n,) of points, 0xRRGGBBAA; those of a depth image are shaded.
 
-    ``pixels`` (n,) are the flat indices of the points; the other parameters are as in `_colours`.
+    ``pixels`` (n,) are the flat indices of the points; ``points``, ``tones`` and ``palette`` are as
+    in `_colours`.
     """
     light = np.ones(pixels.size, np.float32)
     if frame.depth is not None and frame.camera is not None:

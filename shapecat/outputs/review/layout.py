@@ -90,7 +90,7 @@ def _up(labelled: LabelledFrame, frame: Frame) -> F8:
 def _subject(labelled: LabelledFrame, frame: Frame, pose: Pose) -> tuple[F8, float]:
     """Return a sphere around the objects, or else around the planes or the points.
 
-    It is given by its centre (3,), in the frame to which ``pose`` transforms, and radius, metres.
+    The result is its centre (3,), in the frame to which ``pose`` transforms, and radius, metres.
     """
     if labelled.objects:
         half = [np.full(3, o.box.size.max() / 2) for o in labelled.objects]
