@@ -60,7 +60,7 @@ def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[li
 
 
 def _require_replaceable(path: Path) -> list[Path]:
-    """Return the files of a folder that a recording may replace; none if the path is no folder.
+    """Return the files of a folder that a recording may replace; none if it is not a folder.
 
     Raises
     ------

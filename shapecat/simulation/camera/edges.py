@@ -152,9 +152,9 @@ def drop_margins(inverse: F8, width: int, lost: Bool) -> None:
 
 @kernel
 def _blend(inverse: F8, radius: int, out: F8) -> None:
-    """Average the inverse depth (h, w) over a window where a row crosses an edge, into ``out``.
+    """Write to ``out`` inverse depth (h, w), averaged over windows whose middle row has an edge.
 
-    The window extends ``radius`` pixels to each side. Elsewhere, the inverse depth is copied.
+    A window extends ``radius`` pixels to each side. Elsewhere, the inverse depth is copied.
     """
     height, width = inverse.shape
     for v in range(height):

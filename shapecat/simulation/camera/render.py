@@ -175,7 +175,7 @@ def _rasterize(
             top = max(top, int(np.ceil(fy * min(v0, v1, v2) + cy)))
             bottom = min(bottom, int(np.floor(fy * max(v0, v1, v2) + cy)))
             u0, u1, u2 = ax / az, bx / bz, dx / dz
-            # A pixel of margin: the spans below decide, and round alike for neighbours.
+            # One pixel more on each side: the spans below decide, in the same way for neighbours.
             left = max(left, int(np.floor(fx * min(u0, u1, u2) + cx)))
             right = min(right, int(np.ceil(fx * max(u0, u1, u2) + cx)))
             if top > bottom or left > right:

@@ -193,7 +193,7 @@ def _placed_object(
 ) -> PlacedObject:
     """Return an item where it has landed; ``tracks`` are the tracks of all items."""
     supported_by = landed.supported_by
-    axes = landed.pose.rotation[2]  # world z of the object's own axes
+    axes = landed.pose.rotation[2]  # world z component of each axis of the object
     return PlacedObject(
         track,
         item.category,

@@ -97,7 +97,7 @@ class _Groups:
 
         Parameters
         ----------
-        yaw : direction of its rows about z, radians.
+        yaw : direction of the rows of the group about z, radians.
         headroom_m : maximum height of the group.
         """
         rng, edge = self._rng, support.outline[:, :2]

@@ -214,7 +214,7 @@ def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
 
 
 def _pump(rng: Generator, radius: float, height: float) -> list[Mesh]:
-    """Return the head of a lotion pump, a stem with a spout; ``radius`` is that of the neck."""
+    """Return the stem and spout of a pump; the bottle has this height and a neck of this radius."""
     stem = rng.uniform(0.02, 0.045)
     thick = float(np.clip(0.35 * radius, 0.003, 0.006))
     z = height + stem

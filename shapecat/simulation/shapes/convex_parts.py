@@ -92,7 +92,7 @@ def _blocks(points: F8) -> Iterator[F8]:
 
 
 def _thickened(points: F8) -> F8:
-    """Thicken a flat part (n, 3) to at least twice `_SKIN_M` in all directions."""
+    """Return a part (n, 3) as points (m, 3), at least twice `_SKIN_M` thick in all directions."""
     for _ in range(3):  # a plane, a line, or a point
         middle = points.mean(axis=0)
         normal = np.linalg.eigh((points - middle).T @ (points - middle))[1][:, 0]

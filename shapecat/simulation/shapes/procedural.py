@@ -124,7 +124,7 @@ def _frame(rng: Generator) -> Mesh:
 
 
 def _block(rng: Generator) -> Mesh:
-    """Return a building block that is no box: a prism, part of a disc, cross, L, T or bridge."""
+    """Return a building block other than a box: a prism, part of a disc, cross, L, T or bridge."""
     size, kind = log_uniform(rng, 0.018, 0.05), rng.integers(4)
     thick = size * log_uniform(rng, 0.5, 2.0)
     if kind == 0:
