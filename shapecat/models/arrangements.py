@@ -211,7 +211,7 @@ def placed(
 def _free_spot(
     spots: Sequence[tuple[float, float, float]], radius: float, rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """Return a free position (x, y) near the middle of the table; None if it finds none.
+    """Return a position (x, y) near the middle of the table, free within ``radius``; or None.
 
     ``spots`` holds the (x, y, radius) of the objects placed so far, in metres.
     """

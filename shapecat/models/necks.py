@@ -75,7 +75,7 @@ def split_necks(graph: SurfaceGraph, labels: I4, n: int) -> int:
 
 @kernel
 def _distances(links: U1, spans: I4, labels: I4) -> tuple[I4, int]:
-    """Return the distance of each labelled cell from the border of its label, and the cell count.
+    """Return the distance of labelled cells from the border of their label, and their number.
 
     The distances (rows, columns) are in thirds of a cell, and uninitialised elsewhere.
     ``labels`` are (rows, columns); ``links`` and ``spans`` are as in `SurfaceGraph`.
