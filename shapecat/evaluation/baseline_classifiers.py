@@ -101,9 +101,10 @@ class Densities:
         return np.asarray(np.clip(values, -_CLIP, _CLIP))
 
     def _own_densities(self, views: Sequence[F8], block: slice, width: float) -> F8:
-        """Return the log densities (n,) of views in a block, under their own categories.
+        """Return the finite log densities (n,) of views in a block, under their own categories.
 
-        ``views`` are (k, d) for each category; ``width`` is the bandwidth of the block.
+        ``views`` are (k, d) for each category; ``width`` is the bandwidth of the block. The result
+        is a single 0 if no density is finite.
         """
         pairs = zip(views, self._kernels, strict=True)
         values = [_log_density(z[:, block], own[:, block], width) for z, own in pairs]

@@ -125,7 +125,7 @@ def _predict_all(
 
 
 def _compared(name: str, learned: int, truth: I4, posteriors: F8) -> Compared:
-    """Return the figures of a classifier that was trained on ``learned`` views.
+    """Return the metrics of a classifier that was trained on ``learned`` views.
 
     ``truth`` and ``posteriors`` are from `_predict_all`.
     """

@@ -72,7 +72,7 @@ def _require_other_views(test: Dataset, root: Path, training_set: Path) -> None:
 
     Raises
     ------
-    RecordingError : a view is.
+    RecordingError : a tested view is also in the training set.
     """
     for path in test.files:
         other = training_set / path.relative_to(root)

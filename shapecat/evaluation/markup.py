@@ -1,4 +1,4 @@
-"""Figures as text, and tables of them as HTML."""
+"""Metrics as text, and tables as HTML."""
 
 from collections.abc import Sequence
 from html import escape
@@ -7,7 +7,7 @@ __all__ = ["figure_text", "html_table"]
 
 
 def figure_text(value: float | None, missing: str = "–") -> str:
-    """Return a figure with three decimals; ``missing`` if it is None."""
+    """Return a number with three decimals; ``missing`` if it is None."""
     return missing if value is None else f"{value:.3f}"
 
 

@@ -204,7 +204,7 @@ def _count_matches(
 
 
 def _alignment(occurrences: _Occurrences) -> F8:
-    """Return how well two identities coincide over all frames, from 0 to 1, for (true, found)."""
+    """Return how well each pair of identities coincides over all frames, (true, found), 0 to 1."""
     together = np.zeros((occurrences.true.size, occurrences.found.size))
     for true, found, similarity in occurrences.frames:
         beside = similarity.sum(axis=0) + similarity.sum(axis=1)[:, None] - similarity

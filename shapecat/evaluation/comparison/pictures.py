@@ -28,7 +28,7 @@ _INK = 0.55
 
 
 class Caption(NamedTuple):
-    """A text and its position in the picture, pixels."""
+    """A text, and the middle of its baseline in the picture, pixels."""
 
     x: float
     y: float

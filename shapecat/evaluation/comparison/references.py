@@ -152,7 +152,7 @@ class _LabelImages:
             raise RecordingError(msg) from error
 
     def read(self, index: int) -> U1:
-        """Return an image (h, w); afterwards, no earlier image can be read.
+        """Return an image (h, w); reading one before the last one read is slow.
 
         Raises
         ------
