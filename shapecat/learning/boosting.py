@@ -133,7 +133,8 @@ def _grow(
 ) -> int:
     """Grow a tree into ``feature``, ``cut``, ``left`` and ``value``; return its number of nodes.
 
-    ``cut`` is the last bin that goes left; the other parameters are as for `grow_tree`.
+    ``cut`` is the last bin that goes left. The other parameters are as in `Bins`, `TreeSettings`
+    and `Tree`, or as for `grow_tree`.
     """
     room = feature.size
     first, last = np.zeros(room, np.int64), np.zeros(room, np.int64)
@@ -151,15 +152,15 @@ def _grow(
             break
         column = columns[int(best[node, 1])]
         feature[node], cut[node], left[node] = column, int(best[node, 2]), count
-        middle = _divide(binned[column], rows, first[node], last[node], cut[node], spare)
         # (2) Divide its views, keeping their order.
+        middle = _divide(binned[column], rows, first[node], last[node], cut[node], spare)
         first[count], last[count] = first[node], middle
         first[count + 1], last[count + 1] = middle, last[node]
         # (3) Sum up the smaller child; the larger one is the parent minus this.
         small = count if middle - first[node] <= last[node] - middle else count + 1
         large = 2 * count + 1 - small
         _collect(binned, columns, rows[first[small] : last[small]], gradient, hessian, sums[small])
-        for c in range(columns.size):  # as one assignment, 2 s more to compile
+        for c in range(columns.size):  # a single assignment takes 2 s more to compile
             for k in range(BINS):
                 for part in range(2):
                     sums[large, c, k, part] = sums[node, c, k, part] - sums[small, c, k, part]
@@ -223,8 +224,8 @@ def _best_cut(sums: F4, l2: float, min_hessian: float, best: F8) -> float:
 def _divide(bins: U1, rows: I4, first: int, last: int, cut: int, spare: I4) -> int:
     """Move the views with bins <= ``cut`` to the front of rows[first:last], keeping their order.
 
-    ``bins`` (n,) are the bins of all views in one feature. Returns the index in ``rows`` of the
-    first view that is not moved; ``spare`` is work space of the size of ``rows``.
+    ``bins`` (n,) are the bins of all views in one feature. Returns the index in ``rows``
+    where the other views begin; ``spare`` is work space of the size of ``rows``.
     """
     low, high = first, 0
     for i in range(first, last):
@@ -234,7 +235,7 @@ def _divide(bins: U1, rows: I4, first: int, last: int, cut: int, spare: I4) -> i
         else:
             spare[high] = rows[i]
             high += 1
-    for i in range(high):  # as one assignment, 2 s more to compile
+    for i in range(high):  # a single assignment takes 2 s more to compile
         rows[low + i] = spare[i]
     return low
 

@@ -200,7 +200,7 @@ def _shift(
 ) -> float:
     """Return the constant to add to the new logits: the largest that does little harm.
 
-    It is limited to 0 to `_LARGEST_SHIFT`. With it, the new categories take over at most a fraction
+    It is between 0 and `_LARGEST_SHIFT`. With it, the new categories take over at most a fraction
     `_LOST` of the views that the old logits categorize correctly. The new logits of a view come
     from a fit without the view. The parameters are as for `_fit_new`; ``learned`` are the weights
     that it returned for all views.

@@ -74,7 +74,7 @@ def fit_categorizer(
 
     Parameters
     ----------
-    train : training views; those with a label that is no category are learned as unknown shapes.
+    train : training views; those whose label is not a category are learned as unknown shapes.
     held_out : views of other instances, for fitting the temperature and the novelty threshold.
     descriptor_names : names of the components of the descriptor.
     categories : the categories in the order of the posterior.
