@@ -244,8 +244,8 @@ def _majority(labels: I4, label: int, radius: int, pixels: Bool) -> tuple[int, i
     """Set each of ``pixels`` (h, w) if most pixels of the square around it have the label.
 
     ``labels`` (h, w) are those of the pixels. The square extends ``radius`` pixels to each side;
-    only its part within the image counts. Returns left, top, right + 1 and bottom + 1 of the pixels
-    that are set.
+    only its part within ``labels`` counts. Returns left, top, right + 1 and bottom + 1 of the
+    pixels that are set.
     """
     height, width = labels.shape
     west, north, east, south = width, height, 0, 0

@@ -270,7 +270,7 @@ def _nearest_surface(around: F4, corner: tuple[int, int], cell: int, shape: tupl
 
 @kernel(inner=True)
 def _hide(front: F4, cell: int, boxes: I4, nearest: F4, splat: I4) -> None:
-    """Set pixels in boxes to label 0 where another surface hides their object, or they have none.
+    """Set pixels in boxes to label 0 where another surface hides their object, or is all they show.
 
     ``boxes`` are as in `splat_depth`; ``front`` is from `_nearest_surface`, with its ``cell``;
     ``splat`` (h, w) holds the labels, ``nearest`` (h, w) their inverse depth, 0 without a label.
