@@ -184,7 +184,7 @@ def _turned_from(base: F8, elongation: float, axes: F8, sizes: F8) -> Bool:
 
 
 def _yaws(base: F8, axes: F8) -> F8:
-    """Return the yaws (k,), radians, of boxes with ``axes`` (k, 3, 3), relative to ``base``."""
+    """Return yaws (k,), radians, of boxes with ``axes`` (k, 3, 3), relative to ``base`` (3, 3)."""
     x, y, _ = (axes[:, :, 0] @ base).T
     return np.asarray(np.arctan2(y, x))
 
@@ -247,7 +247,7 @@ def _turned(outlines: F8, angles: F8) -> F8:
 
 
 def _alike(axes: F8, sizes: F8, size: F8) -> F8:
-    """Return axes (k, 3, 3), turned by 90 degrees if the longer side is the shorter of ``size``.
+    """Return axes (k, 3, 3), turned by 90 degrees if the longer one is not that of ``size``.
 
     ``sizes`` (k, 3) are the lengths along these axes, ``size`` (3,) those of the fused box.
     """

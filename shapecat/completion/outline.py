@@ -24,7 +24,7 @@ __all__ = [
 ]
 
 DIRECTIONS = 96
-"""Directions of an outline, every 3.75 degrees; a quarter turn is a whole number of them."""
+"""Number of directions of an outline, 3.75 degrees apart; divisible by 4."""
 _ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 COSINES, SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 QUARTER, _HALF = DIRECTIONS // 4, DIRECTIONS // 2

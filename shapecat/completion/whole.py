@@ -29,7 +29,7 @@ _TOP = 0.98
 _NOISY_M = 0.004
 """Largest height by which noise lifts points of a flat top, metres."""
 _FLAT = 1 / 3
-"""Minimum fraction of the points that a flat face has."""
+"""A face with at least this fraction of the points counts as flat, one with fewer in proportion."""
 _HANDLE = 0.06
 """Minimum length by which a handle sticks out of a cup's oval, as a fraction of the radius."""
 _EDGEWISE = -0.2
