@@ -10,9 +10,9 @@ from shapecat.types import Camera, Pose
 __all__ = ["agreement"]
 
 _SAMPLES = 256
-"""Approximate number of points to compare."""
+"""Approximate number of points that are sampled."""
 _KNOWN = 0.5
-"""Minimum fraction of the compared points that must have depth in the other image."""
+"""Minimum fraction of the sampled points that can be compared; others have no depth to compare."""
 
 
 def agreement(
