@@ -30,7 +30,7 @@ from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.types import Box
 
 SAME = 0.5
-"""IoU of masks from which a detection matches an object."""
+"""Minimum IoU of the masks of a detection and the object that it matches."""
 ROUND = ("cup", "can", "bottle", "bowl", "plate", "ball")
 """Categories whose objects are solids of revolution; most have nearly equal length and width."""
 ALIKE = 0.05

@@ -188,7 +188,7 @@ def draw(path: Path, results: dict[str, list[dict[str, float]]]) -> None:
 
 
 def per_hour(costs: Measured, given: Assumed) -> list[tuple[str, ...]]:
-    """Return the cost of a recorded hour: wall time, CPU time, storage, and the bottleneck."""
+    """Return rows of the cost of a recorded hour: hardware, wall s, CPU hours, GB, bottleneck."""
     frames = 30 * 3600.0
     cpu_h = frames * costs.frame_s / 3600
     rows: list[tuple[str, ...]] = []
@@ -209,7 +209,10 @@ def per_hour(costs: Measured, given: Assumed) -> list[tuple[str, ...]]:
 
 
 def check(folder: Path, *, recordings: int, frames: int) -> list[tuple[str, ...]]:
-    """Compare the model with 1 to 4 workers that share the two cores of this machine."""
+    """Compare the model with 1 to 4 workers that share the two cores of this machine.
+
+    Return rows of the number of workers, the measured and the modelled seconds, and the error, %.
+    """
     from tests.scenes import record  # noqa: PLC0415  the small scene of the tests
 
     (folder / "in").mkdir()

@@ -27,7 +27,7 @@ def objects_in(frame: Frame) -> list[Array]:
 
 
 def score(frames: Sequence[Labelled], finder: Finder) -> dict[str, float]:
-    """Match found and true objects one to one; return overlap F and the fraction found."""
+    """Match objects one to one; return overlap F, the fraction found, and the number of objects."""
     total = Overlap()
     for frame, labels, objects in frames:
         masks = [np.flatnonzero(np.isin(labels, parts)) for parts in objects]

@@ -2,7 +2,7 @@
 //
 // usage: pcl_detection CLOUDS REPEATS
 // CLOUDS holds frames: int32 width, int32 height, float32 up[3], then width * height * 3 float32
-// (NaN: no reading).
+// (NaN: no depth).
 // Prints a line per frame and method: method, frame, milliseconds of CPU time (the best of REPEATS),
 // number of clusters.
 #include <pcl/ModelCoefficients.h>

@@ -27,7 +27,7 @@ from shapecat.simulation.shapes.primitives import rounded_box
 from shapecat.types import CATEGORIES, Camera, Frame, Pose, Scene
 
 HEIGHT_M, TILT_COS = 0.02, float(np.cos(np.radians(4)))
-"""Maximum height of a found plane above or below the table, and cosine of its maximum tilt."""
+"""Maximum distance of a found plane above or below the table, and cosine of its maximum tilt."""
 COVERED, SHOWN, SEEN = 0.8, 0.2, 0.01
 """Fraction of a covered table under boxes; fraction of the image filled by a cut table and its
 objects; least fraction of the image in which a covered table is visible between its boxes."""

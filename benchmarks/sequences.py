@@ -39,7 +39,7 @@ object's length."""
 RANGE_M = 2.0
 """Objects and tracks farther from the sensor are ignored."""
 SAME = 0.5
-"""IoU of masks from which a detection matches an object."""
+"""Minimum IoU of the masks of a detection and the object that it matches."""
 VIEWS = (1, 3, 10, 30)
 
 

@@ -116,7 +116,7 @@ def spend(
 
 
 def speed(folder: Path, frames: int, repeats: int, against: Path | None) -> str:
-    """Measure the frames per second with all outputs, on one core and on two."""
+    """Return a table of the frames per second with all outputs, on one core and on two."""
     views, objects = tabletop(60)
     rows: list[tuple[Any, ...]] = []
     for camera, seen in (("walking", views), ("still", standing(60))):
@@ -160,7 +160,7 @@ def _measure(
 
 
 def growth(folder: Path, counts: list[int]) -> str:
-    """Measure cost per additional frame and peak memory over the number of frames, on one core."""
+    """Return a table of CPU time per additional frame and peak memory, by number of frames."""
     views, _ = tabletop(60)
     cores = set(sorted(os.sched_getaffinity(0))[:1])
     rows = []
