@@ -209,10 +209,7 @@ def per_hour(costs: Measured, given: Assumed) -> list[tuple[str, ...]]:
 
 
 def check(folder: Path, *, recordings: int, frames: int) -> list[tuple[str, ...]]:
-    """Compare the model with 1 to 4 workers that share the two cores of this machine.
-
-    Return rows of the number of workers, the measured and the modelled seconds, and the error, %.
-    """
+    """Return rows: workers (1 to 4 on two cores), measured and modelled seconds, and error (%)."""
     from tests.scenes import record  # noqa: PLC0415  the small scene of the tests
 
     (folder / "in").mkdir()
