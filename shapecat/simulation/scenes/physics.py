@@ -51,8 +51,8 @@ class SettledPose(NamedTuple):
     Attributes
     ----------
     pose : ``world_from_mesh``, rounded to 1 um.
-    supported_by : index of the object that carries most of its weight; None if it is an obstacle,
-        or the object is in the air.
+    supported_by : index of the object that carries most of its weight; None if an obstacle does,
+        or nothing.
     """
 
     pose: Pose
