@@ -39,7 +39,7 @@ WORKERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 LINES = 3  # lines of the manifest for each recording: planned, running, complete
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Assumed:
     """Assumptions of the simulation."""
 
@@ -226,7 +226,8 @@ def check(folder: Path, *, recordings: int, frames: int) -> list[tuple[str, ...]
     frame_s = (long_s - startup_s) / (frames - 1)
     base_s = wall_s("w1", folder / "in", 1)
     recording_s = max(0.0, (base_s - startup_s) / recordings - frames * frame_s)
-    given = Assumed(recordings, frames, 0.0, 0.0, 0.0, 1e9, 1e9, startup_s, recording_s, 2)
+    given = Assumed(recordings=recordings, median_frames=frames, startup_s=startup_s, cores=2)
+    given = replace(given, spread=0.0, read_mb=0.0, written_mb=0.0, recording_s=recording_s)
     costs = Measured(frame_s, 0.001, 0.0001, 0.001)
     rows: list[tuple[str, ...]] = []
     for workers in range(1, 5):
