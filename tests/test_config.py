@@ -42,8 +42,10 @@ def test_deeply_nested_settings_are_refused(
     """TOML and JSON allow any nesting, and Python has an error of its own for it."""
     (tmp_path / "s.toml").write_text(text)
 
-    with pytest.raises(ConfigError, match="settings are nested too deeply"):
+    # From Python 3.13 on, there is no such error for a dictionary.
+    with pytest.raises(ConfigError, match=r"nested too deeply|got \{'a': .*\.\.\.") as caught:
         load_settings(tmp_path / "s.toml", overrides)
+    assert len(str(caught.value)) < 200
 
 
 def test_numbers_of_numpy_are_settings() -> None:
