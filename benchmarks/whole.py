@@ -44,7 +44,7 @@ class View(NamedTuple):
 
 
 def find_world(frames: int, objects: int) -> World:
-    """Return the first of 100 simulated tables with this number of objects, else the last one."""
+    """Return the first of 100 simulated scenes with this number of objects, else the last one."""
     for seed in range(SEED, SEED + 100):
         world = make_scene("tabletop", np.random.default_rng(seed), frames=frames)
         if len(world.objects) == objects:

@@ -79,7 +79,7 @@ def print_json(value: Any) -> None:
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print a table with right-aligned columns of numbers; text is not interpreted as markup.
 
-    On a terminal, lines are folded to its width.
+    On a terminal, cells are wrapped to fit its width.
     """
     from rich.console import Console
     from rich.table import Table

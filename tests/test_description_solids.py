@@ -140,7 +140,7 @@ def test_outline_is_independent_of_depth_errors() -> None:
 
 
 def test_long_outline_ends_at_narrow_end() -> None:
-    """A lying bottle must have one outline whether it points left or right."""
+    """A lying bottle must have the same outline whether it points left or right."""
     rng = np.random.default_rng(0)
     points, _ = half_cone(rng, slope=0.35)
     lying = points[:, [0, 2, 1]] * [1, 1.5, 1]

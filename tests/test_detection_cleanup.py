@@ -40,7 +40,10 @@ INTRINSICS = PinholeIntrinsics(262.5, 262.5, 19.5, 19.5)
 
 
 def features_of(shapes: list[Shape], tilt_deg: float) -> tuple[Array, Array]:
-    """Return the object features of segments on a table, and whether they are rejected."""
+    """Return the object features (n,) of the segments on a table, and which are rejected (n,).
+
+    The camera looks down by ``tilt_deg``. Segments that were merged into others are left out.
+    """
     depth, _ = render(shapes, tilt_deg=tilt_deg)
     frame, settings = frame_of(depth), DetectionSettings()
     assert frame.depth is not None

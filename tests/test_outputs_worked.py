@@ -396,7 +396,7 @@ def test_moving_camera_does_not_redraw_static_scene(
 
 
 def test_scene_at_unknown_place_is_not_drawn() -> None:
-    """Before the first transform, the cloud was at the origin of the fixed frame, on its side."""
+    """Before the first transform, the cloud would appear at the origin, on its side."""
     pose = Pose(np.eye(3), np.array([0.4, 0.7, 1.5]))
     frames = [
         replace(labelled_frame(1000 * k, topic=topic), fixed_from_sensor=pose if known else None)

@@ -221,7 +221,7 @@ def test_one_bad_frame_is_not_a_scene_cut() -> None:
 
 
 def test_one_of_two_objects_moved_is_not_a_scene_cut() -> None:
-    """At one image per second, the object that stayed would get a new track."""
+    """At one image per second, a cut would give the object that stayed a new track."""
     places = [[[0, 0, 0], [0.4, 0, 0]]] * 5 + [[[0, 0, 0], [0.4, 0.2, 0]]] * 5
     frames = [frame(k, both, stamp_ns=k * SECOND) for k, both in enumerate(places)]
 

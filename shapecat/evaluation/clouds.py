@@ -164,7 +164,7 @@ def _xyz(body: bytes, layout: _Layout) -> F8:
 
     Raises
     ------
-    ValueError : the body has fewer points, or its encoding is unknown.
+    ValueError : the body has fewer points or other text, or the encoding or the number is invalid.
     """
     if layout.encoding == "ascii":
         columns = _ascii_columns(layout.point)

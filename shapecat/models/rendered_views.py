@@ -93,7 +93,7 @@ def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
 
 
 def _viewpoint(arrangement: Arrangement, sensor: Sensor, rng: np.random.Generator) -> Pose:
-    """Draw ``table_from_camera``, 0.25 to 3 m from the objects, within the arrangement's angles."""
+    """Draw ``table_from_camera`` within the range of the sensor and the arrangement's angles."""
     points = np.concatenate([item.mesh.vertices for item in arrangement.objects])
     target = points.mean(axis=0) + rng.normal(0, 0.04, 3)
     nearest, farthest = _DISTANCES_M

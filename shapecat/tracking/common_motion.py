@@ -50,9 +50,10 @@ class CommonMotion:
         return replace(table, centers=centers, orientations=orientations)
 
     def unstabilised(self, rows: I4, places: F8) -> F8:
-        """Transform ``places`` (k, 3), metres, back from the coordinate frame of the still objects.
+        """Transform ``places`` (k, 3), metres, from the frame of the still objects back.
 
-        The result is in the coordinate frame of the detections in frames ``rows`` (k,).
+        The result is in the coordinate frame of the detections. ``rows`` (k,) is the index of the
+        image at whose time each place is wanted.
         """
         return np.asarray(
             np.einsum("kji,kj->ki", self.rotations[rows], places - self.translations[rows])

@@ -98,12 +98,13 @@ def measure_heights(grid: DepthGrid, planes: Records, max_height_m: float) -> He
 def _assign(
     grid: DepthGrid, plane: Row, number: int, max_height_m: float, heights: HeightMap
 ) -> None:
-    """Assign to a plane the cells inside its outline that belong to no plane yet.
+    """Write to ``heights`` the cells above or on a plane that belong to no plane yet.
 
-    ``plane`` is a `PLANE`; ``number``, from 1, becomes the `HeightMap.plane_id` of the cells above
-    it, and minus ``number`` that of its own cells; ``max_height_m`` is the maximum height above it,
-    metres. The kernel is compiled without ``fast``: with it, the inlined copy would round heights
-    differently in the process that compiles it and in later ones.
+    Cells above it must be inside its outline and below ``max_height_m``, metres; cells on it, less
+    than `BEYOND_M` outside. ``plane`` is a `PLANE`. The `HeightMap.plane_id` of cells above it is
+    ``number``, from 1; that of cells on it is ``-number``. The kernel is compiled without ``fast``:
+    with it, its copy in `measure_heights` would round heights differently in the process that
+    compiles it and in later ones.
     """
     inv_depth, intrinsics, (plane_id, height) = grid.inverse_depth, grid.intrinsics, heights
     rows, columns = inv_depth.shape

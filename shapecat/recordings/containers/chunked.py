@@ -131,7 +131,10 @@ class ChunkedRecording(Recording):
         return all(indexed.get(number) == channel for number, channel in found.items())
 
     def _scan(self) -> Any:
-        """Read the whole file to find its channels, counts and times; return the last record."""
+        """Read the whole file to find its channels, counts and times.
+
+        Returns the last record; None if there is none.
+        """
         self._forget_channels()
         self._counts.clear()
         record = None

@@ -176,7 +176,7 @@ class TransformBuffer:
         return ""
 
     def find_replaced(self) -> str:
-        """Return a warning about static transforms that differ; empty if there are none."""
+        """Return a warning about static transforms that were replaced by others; empty if none."""
         names = listed(sorted(self._replaced))
         found = f"static ones of {names} differ: the last is used for the whole recording"
         return found if names else ""

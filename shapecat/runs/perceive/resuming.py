@@ -188,7 +188,7 @@ def _same_recording_and_versions(
 
 
 def _is_complete(folder: Path, run: RunInfo) -> bool:
-    """Return whether *perceive* and *revise* are done, and the tables have all rows as counted."""
+    """Return whether *perceive* and *revise* are done, and the tables have the rows counted."""
     counts = run["counts"]
     return (
         {"perceive", "revise"} <= run["seconds"].keys()

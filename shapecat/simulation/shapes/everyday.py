@@ -92,7 +92,7 @@ _GADGET = ((0.05, 0.2), (0.03, 0.12), (0.012, 0.07))
 
 
 def _power_tool(rng: Generator) -> Mesh:
-    """Return a barrel with a grip and sometimes a foot: a drill, pistol, hair dryer or pliers."""
+    """Return a barrel with a grip and sometimes a foot: a drill, pistol or hair dryer."""
     long, thick = log_uniform(rng, 0.09, 0.22), log_uniform(rng, 0.012, 0.03)
     path = long * np.array([[0, 0, 0], [0.5, 0, 0], [1, 0, rng.uniform(-0.1, 0.1)]])
     width = thick * np.interp(np.linspace(0, 1, 12), [0, 0.3, 0.7, 1], rng.uniform(0.5, 1.2, 4))
