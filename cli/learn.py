@@ -22,8 +22,8 @@ def learn(
 ) -> None:
     """Add the new categories of a data set to a model.
 
-    MODEL is a model file, or `default` for the model that comes with shapecat. What it has learned
-    about its own categories does not change. DATASET is laid out as for `shapecat train`;
+    MODEL is a model file, or `default` for the model that comes with shapecat. What the model
+    has learned about its own categories is kept. DATASET is laid out as for `shapecat train`;
     `shapecat export --format crops` writes such a data set. Views of `unknown` are not used.
 
     \b

@@ -88,7 +88,7 @@ if TYPE_CHECKING:
     "shows bars on a terminal, else plain lines.",
 )
 @click.option(
-    "--color", metavar="TOPIC", help="Topic of colour images; by default chosen for each camera."
+    "--color", metavar="TOPIC", help="Topic of colour images; by default one for each camera."
 )
 @click.option("--no-color", is_flag=True, help="Do not use colour images.")
 @boxes_option("In annotated.mcap, {}; full by default.")
@@ -140,8 +140,8 @@ def process(
 
     Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a folder with
     recordings, or a URL. The results of lab.mcap go to OUT/lab: tables, annotated.mcap for
-    Foxglove, and review.rrd for Rerun. If recordings have the same name, the name of the folder
-    comes first, as in OUT/monday_lab; if those are the same as well, a number is appended.
+    Foxglove, and review.rrd for Rerun. If recordings have the same name, that of their folder
+    is put in front, as in OUT/monday_lab; if results still coincide, a number is appended.
     For several recordings, OUT/manifest.jsonl records the state of each. To resume after an
     interruption, run the same command again.
 

@@ -120,7 +120,7 @@ class Progress:
         self.note(kernel_words(phase, done))
 
     def ended(self, outcome: "Outcome") -> None:
-        """Receive the outcome of a recording."""
+        """Count a recording that has ended, and show its outcome."""
         with self.lock:
             name = outcome.job.folder.name
             self.running.pop(name, None)

@@ -14,7 +14,7 @@ from .options import ANY_PATH
 )
 @click.option("--topic", metavar="TOPIC", help="Topic of the frame, if the run has several.")
 def scene(*, run: Path, frame: int, topic: str | None) -> None:
-    """Print the planes of one frame and the objects that stand on them.
+    """Print the planes of one frame, and the objects on them.
 
     Tracks that a person merged are one object; tracks that a person deleted are left out.
 

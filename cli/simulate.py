@@ -73,11 +73,11 @@ def simulate(
     \b
     Scenes:
     tabletop    separate objects on a table
-    shelf       objects on three boards of a shelf
+    shelf       objects on the three shelves of a rack
     clutter     objects close together and stacked on a table
     pile        objects dropped in a heap on a table
     bin         objects dropped into a bin
-    shelf_bin   objects in a compartment of a shelf, seen from the front
+    shelf_bin   objects in a compartment of a rack, seen from the front
     room        a table among robot arms, people and furniture
     rows        similar objects in rows, grids and stacks
     turntable   a turntable in front of a fixed camera

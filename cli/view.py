@@ -23,7 +23,7 @@ from .options import ANY_PATH
     help="Write a screenshot instead of opening a window.",
 )
 def view(*, run: Path, web: bool, screenshot: Path | None) -> None:
-    """Open review.rrd of a run in the Rerun viewer.
+    """Open the review.rrd of a run in the Rerun viewer.
 
     \b
     shapecat view results/lab

@@ -68,7 +68,12 @@ class Claim:
         self.inherited = not self._create()
 
     def _create(self) -> bool:
-        """Create the claim and return True, or take it over and return False."""
+        """Create the claim and return True, or take it over and return False.
+
+        Raises
+        ------
+        OutputError : the owner of the claim is alive.
+        """
         while not self._object.create(self._content()):
             content = self._object.read()
             if content is None:

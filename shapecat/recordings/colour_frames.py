@@ -72,9 +72,10 @@ def frames_with_colour(
 
     Yields
     ------
-    Each frame with the colour image that has the nearest stamp, or None if no readable image is
-    within half a period of the colour stream. Unless ``needed`` is given, a warning counts the
-    frames without an image.
+    Each frame with its colour image: the one that ``same_images`` names or, without it, the one
+    with the nearest stamp, at most half a period of the colour stream away. None replaces an image
+    that is missing, unreadable, or without a calibration or a transform. Unless ``needed`` is
+    given, a warning counts the frames without an image.
     """
     partners = {
         stream.topic: _Partner(recording, stream, colours[stream.topic], same_images)

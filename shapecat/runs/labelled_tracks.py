@@ -97,7 +97,7 @@ class LabelledTracks:
             )
 
     def objects(self, key: Key) -> dict[TrackLabel, dict[int, int]]:
-        """Return the objects of a frame: by label, the number and array row of each detection.
+        """Return the objects of a frame: for each label, the array row of each detection number.
 
         An object has several detections if a person merged tracks that are both in the frame.
         Objects are in the order of their first detections.

@@ -96,7 +96,7 @@ def as_rows(features: Records) -> F4:
 
 
 def is_uncertain(logits: F4) -> Bool:
-    """Return which segments to classify again in context, (n,), from their ``logits`` (n,)."""
+    """Return which segments (n,) to classify again in context, given their ``logits`` (n,)."""
     uncertain: Bool = np.abs(logits) < CLEANUP.uncertain_logit
     return uncertain
 

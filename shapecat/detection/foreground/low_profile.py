@@ -295,9 +295,9 @@ def _drop_error(
 def _is_flat(residual: F4, i: int, j: int) -> bool:
     """Return whether the surface is flat around the low cell in row ``i`` and column ``j``.
 
-    The four cells two rows or two columns away are low too, and differ from it by at most
-    `LOW.side`. On the side of an object, some are not low, or differ more. ``residual`` (rows,
-    columns), 1/m, is from `measure_residual`.
+    It is if the four cells two rows or two columns away are low too, and their residuals differ
+    from its own by at most `LOW.side`; on the side of an object, some are not or do not.
+    ``residual`` (rows, columns), 1/m, is from `measure_residual`.
     """
     rows, columns = residual.shape
     value = residual[i, j]

@@ -272,7 +272,7 @@ def _made_by_export(folder: Path) -> Collection[str] | None:
 
 
 def _tracked(frames: Iterable[LabelledFrame], placed: Collection[str]) -> Iterator[LabelledFrame]:
-    """Of the topics ``placed``, tracked in the fixed frame, leave out the frames without a pose."""
+    """Yield the images, except those without a pose on topics that need one (``placed``)."""
     return (f for f in frames if f.fixed_from_sensor is not None or f.topic not in placed)
 
 

@@ -171,7 +171,9 @@ def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:
 
 
 def _understand(label: str, names: dict[str, str]) -> _Verdict:
-    """Interpret a label; add a new category to ``names``.
+    """Interpret a label.
+
+    ``names`` holds the known categories by their names in lower case; a new one is added to it.
 
     Raises
     ------
@@ -218,10 +220,13 @@ def is_category_name(name: str) -> bool:
     return bool(allowed) and name.lower() not in _RESERVED
 
 
-def order_categories(labels: Iterable[str]) -> tuple[str, ...]:
-    """Return the categories among labels: first the default model's, then the others by name."""
-    names = {str(label) for label in labels} - {UNKNOWN}
-    return (*(name for name in CATEGORIES if name in names), *sorted(names - set(CATEGORIES)))
+def order_categories(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the different ``names`` except `UNKNOWN`: those of the default model come first.
+
+    They are in the order of the model; other names follow in alphabetical order.
+    """
+    others = {str(name) for name in names} - {UNKNOWN}
+    return (*(name for name in CATEGORIES if name in others), *sorted(others - set(CATEGORIES)))
 
 
 def _without_marks(text: str) -> str:
