@@ -3,13 +3,13 @@
 import dataclasses
 import difflib
 import json
-import reprlib
 import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 from pathlib import Path
+from reprlib import repr as shown
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from shapecat.errors import ConfigError, explained
@@ -265,17 +265,12 @@ def _replace(group: Any, tree: Mapping[str, Any], prefix: str) -> Any:
         if dataclasses.is_dataclass(current):
             if not isinstance(value, Mapping):
                 first = dataclasses.fields(current)[0].name
-                msg = f"{name} is a group of settings, such as {name}.{first}; got {_shown(value)}"
+                msg = f"{name} is a group of settings, such as {name}.{first}; got {shown(value)}"
                 raise ConfigError(msg)
             changes[key] = _replace(current, value, f"{name}.")
         else:
             changes[key] = _checked(name, value, hints[key])
     return dataclasses.replace(group, **changes)
-
-
-def _shown(value: Any) -> str:
-    """Return the ``repr`` of a value; that of a long or deeply nested one is shortened."""
-    return reprlib.repr(value)
 
 
 _KINDS = {bool: "true or false", int: "an integer", float: "a number"}
@@ -286,7 +281,7 @@ def _checked(name: str, value: Any, kind: Any) -> Any:
     if get_origin(kind) is Literal:
         if value not in get_args(kind):
             allowed = ", ".join(map(str, get_args(kind)))
-            msg = f"{name} must be one of {allowed}, got {_shown(value)}"
+            msg = f"{name} must be one of {allowed}, got {shown(value)}"
             raise ConfigError(msg)
         return value
     if not isinstance(value, bool) and isinstance(value, Real):  # also NumPy scalars
@@ -297,7 +292,7 @@ def _checked(name: str, value: Any, kind: Any) -> Any:
     if kind is float and type(value) is int:
         value = float(value)
     if type(value) is not kind:
-        msg = f"{name} must be {_KINDS[kind]}, got {_shown(value)}"
+        msg = f"{name} must be {_KINDS[kind]}, got {shown(value)}"
         raise ConfigError(msg)
     if isinstance(value, float) and not abs(value) < float("inf"):
         msg = f"{name} must be finite, got {value!r}"

@@ -271,8 +271,8 @@ class _Partner:
             raise MessageError(msg)
         named = not is_of_realsense_recorder(self.stream.topic)
         one_frame = named and same_frame(image.frame_id, frame.frame_id)
-        undistorted = lens is None or is_nearly_aligned(lens, frame.camera)
-        alike = lens is None or (undistorted and are_similar(lens, frame.camera))
+        aligned = lens is None or is_nearly_aligned(lens, frame.camera)
+        alike = lens is None or (aligned and are_similar(lens, frame.camera))
         if same_shape and one_frame and alike:
             return ColourView(image, lens or _lens(frame.camera))
         if lens is None:
@@ -286,7 +286,7 @@ class _Partner:
             return ColourView(image, lens, pose if offset is None else compose(pose, offset))
         # Only registered images have the intrinsics of the depth camera.
         if same_shape and are_equal(lens, frame.camera):
-            return ColourView(image, lens, None if undistorted else IDENTITY)
+            return ColourView(image, lens, None if aligned else IDENTITY)
         names = (name or "a frame without a name" for name in (frame.frame_id, image.frame_id))
         msg = f"no transform between {' and '.join(names)}"
         raise MessageError(msg)

@@ -17,8 +17,8 @@ _NEAR = 0.01
 """Intrinsics that differ by less than this fraction of the image width are similar."""
 _EQUAL = 1e-6
 """Intrinsics that differ by less than this fraction of the image width are equal."""
-_UNDISTORTED_PX = 2.0
-"""A lens is nearly undistorted if it images the ray of each pixel less than this from the pixel."""
+_ALIGNED_PX = 2.0
+"""A lens is nearly aligned if it images the ray of each pixel less than this from the pixel."""
 _STEPS = 9
 """Rows and columns of the grid of pixels at which lens distortion is computed."""
 
@@ -38,7 +38,7 @@ def is_nearly_aligned(lens: LensCamera, camera: Camera | None) -> bool:
 
     The pixels are those of ``camera``. The result is True without a camera or without distortion.
     """
-    return _largest_offset_px(lens, camera) < _UNDISTORTED_PX
+    return _largest_offset_px(lens, camera) < _ALIGNED_PX
 
 
 def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> bool:

@@ -254,14 +254,13 @@ def outputs_pending(folder: Path) -> Iterator[None]:
 
     After a `ShapecatError` in the block, which then has changed nothing, they count as written.
     """
-    before, run = read_run(folder), read_run(folder)
-    for output in OUTPUTS:
-        run["seconds"].pop(output, None)
-    write_run(folder, run)
+    run = read_run(folder)
+    kept = {phase: s for phase, s in run["seconds"].items() if phase not in OUTPUTS}
+    write_run(folder, {**run, "seconds": kept})
     try:
         yield
     except ShapecatError:
-        write_run(folder, before)
+        write_run(folder, run)
         raise
 
 
@@ -307,11 +306,9 @@ def read_identity(folder: Path) -> RunIdentity:
 
 
 def _content_of(folder: Path) -> bytes:
-    try:
-        with explained(f"{folder}/run.json: cannot be read", OutputError):
+    with explained(f"{folder}/run.json: cannot be read", OutputError):
+        try:
             return (folder / "run.json").read_bytes()
-    except OutputError as error:
-        if not isinstance(error.__cause__, FileNotFoundError | NotADirectoryError):
-            raise
-        msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
-        raise OutputError(msg) from error
+        except (FileNotFoundError, NotADirectoryError) as error:
+            msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
+            raise OutputError(msg) from error

@@ -221,12 +221,12 @@ def is_category_name(name: str) -> bool:
 
 
 def order_categories(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the different ``names`` except `UNKNOWN`: those of the default model come first.
+    """Return the distinct ``names`` except `UNKNOWN`: those of the default model come first.
 
     They are in the order of the model; other names follow in alphabetical order.
     """
-    others = {str(name) for name in names} - {UNKNOWN}
-    return (*(name for name in CATEGORIES if name in others), *sorted(others - set(CATEGORIES)))
+    distinct = {str(name) for name in names} - {UNKNOWN}
+    return (*(name for name in CATEGORIES if name in distinct), *sorted(distinct - set(CATEGORIES)))
 
 
 def _without_marks(text: str) -> str:
