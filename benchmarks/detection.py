@@ -96,7 +96,7 @@ def _time_open3d(frames: list[Frame], ups: list[Any]) -> list[float]:
 
 
 def _build_pcl(folder: Path) -> Path | None:
-    """Build the PCL program; return its path, or None if PCL is not installed."""
+    """Build the PCL program; return its path, or None if PCL or g++ is missing."""
     compiler = shutil.which("g++")
     flags = subprocess.run(
         ["pkg-config", "--cflags-only-I", "pcl_segmentation"],

@@ -21,8 +21,8 @@ from .render import note_off_support, print_json, progress_bars
     type=ANY_PATH,
     metavar="TRAINING_SET",
     help="Also train shapecat's classifier and the baselines on TRAINING_SET and test them on "
-    "DATASET. The two must have no view in common. If they are the same folder, shapecat "
-    "cross-validates by instance in up to five folds; each category then needs two instances.",
+    "DATASET. The two must have no view in common, unless they are the same folder: then shapecat "
+    "cross-validates by instance in up to five folds, and each category needs two instances.",
 )
 @json_option
 def evaluate(

@@ -51,9 +51,9 @@ _NO_VAL = (
     type=click.FloatRange(0, 1),
     default=0.0,
     metavar="CONFIDENCE",
-    help="coco, yolo: only objects with at least this confidence, or labelled by a person, are "
-    "reliable. coco marks the others as iscrowd, yolo leaves them out; images without a reliable "
-    "object are left out.",
+    help="coco, yolo: only objects with at least this confidence, or labelled by a person, "
+    "count as reliable. coco marks the others as iscrowd, yolo leaves them out; images without a "
+    "reliable object are left out.",
 )
 @click.option(
     "--corrected-only",

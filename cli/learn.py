@@ -24,7 +24,8 @@ def learn(
 
     MODEL is a model file, or `default` for the model that comes with shapecat. What the model
     has learned about its own categories is kept. DATASET is laid out as for `shapecat train`;
-    `shapecat export --format crops` writes such a data set. Views of `unknown` are not used.
+    `shapecat export --format crops` writes such a data set. Views of `unknown` are not used;
+    views of categories that the model knows are counterexamples.
 
     \b
     shapecat learn default crops --out mine.npz

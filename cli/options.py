@@ -62,7 +62,7 @@ array_option = click.option(
     "--json",
     "as_json",
     is_flag=True,
-    help="Print a JSON array with an entry for each recording that did not fail.",
+    help="Print a JSON array with an entry for each recording without an error.",
 )
 config_option = click.option(
     "--config", type=ANY_PATH, help="TOML file with settings, listed in docs/reference.md."

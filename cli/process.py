@@ -78,8 +78,7 @@ if TYPE_CHECKING:
 @click.option(
     "--shard",
     metavar="I/N",
-    help="Process only part I of N, for job arrays. I is 1 to N, or 0 to N-1; 0 and N are "
-    "the same part.",
+    help="Process only part I of N, for job arrays. I counts from 1 or from 0: part 0 is part N.",
 )
 @choice_option(
     "--progress",
@@ -88,7 +87,7 @@ if TYPE_CHECKING:
     "shows bars on a terminal, else plain lines.",
 )
 @click.option(
-    "--color", metavar="TOPIC", help="Topic of colour images; by default one for each camera."
+    "--color", metavar="TOPIC", help="Topic of colour images; by default that of each depth camera."
 )
 @click.option("--no-color", is_flag=True, help="Do not use colour images.")
 @boxes_option("In annotated.mcap, {}; full by default.")
@@ -141,7 +140,7 @@ def process(
     Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a folder with
     recordings, or a URL. The results of lab.mcap go to OUT/lab: tables, annotated.mcap for
     Foxglove, and review.rrd for Rerun. If recordings have the same name, that of their folder
-    is put in front, as in OUT/monday_lab; if results still coincide, a number is appended.
+    is put in front, as in OUT/monday_lab; if names are still equal, a number is appended.
     For several recordings, OUT/manifest.jsonl records the state of each. To resume after an
     interruption, run the same command again.
 

@@ -1240,8 +1240,8 @@ def test_clouds_have_no_image_in_a_data_set(kind: str) -> None:
     ] * 2
 
 
-def test_long_names_are_cut_between_letters_and_stay_different() -> None:
-    """File systems allow 255 bytes, and a Chinese letter takes three of them."""
+def test_long_names_are_cut_between_characters_and_stay_different() -> None:
+    """Names are cut to 120 bytes, of which a Chinese character takes three."""
     assert safe_name("厨" * 90) == "厨" * 40
     assert safe_name("a" + "厨" * 90) == "a" + "厨" * 39
     assert different_names(["厨" * 90, "厨" * 91, "b"]) == ["厨" * 40, "厨" * 40 + "-2", "b"]

@@ -465,7 +465,7 @@ def test_poses_relate_up_directions_of_moving_camera() -> None:
 
 
 def test_frames_without_planes_do_not_decide_up_in_fixed_frame() -> None:
-    """A camera that looks away for long gives a majority of frames with no plane and a wrong up."""
+    """While a camera looks away for long, most frames have no plane, and their up is wrong."""
     truth, fixed_up = leaning(np.linspace(10, 70, 20)), np.array([0.6, 0.0, 0.8])
     rotation = [rotation_between(v, fixed_up) for v in truth]
     up, offsets = truth.copy(), np.full(20, -0.9)

@@ -63,7 +63,7 @@ def test_corrected_label_reaches_annotated_mcap_and_review(
 
     annotate_again(folder, corrected)
 
-    assert b"wine glass" in plain_mcap(folder / "annotated.mcap")
+    assert b"wine glass" in added_messages(folder / "annotated.mcap")
     from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
 
     labels = {
@@ -79,8 +79,8 @@ def test_corrected_label_reaches_annotated_mcap_and_review(
     assert any("wine glass" in label for label in labels), labels
 
 
-def plain_mcap(path: Path) -> bytes:
-    """Return the data of all messages that were added to a recording, joined."""
+def added_messages(path: Path) -> bytes:
+    """Return the data of all messages on topics of shapecat in an annotated.mcap, joined."""
     from mcap.reader import make_reader  # noqa: PLC0415  beside its only use
 
     with path.open("rb") as file:

@@ -71,7 +71,7 @@ def solids(
 
 @kernel(inner=True)
 def _log_ratio(a: float, b: float) -> float:
-    """Return the logarithm of the ratio of two residuals, bounded where both are small."""
+    """Return the logarithm of the ratio of two residuals; those far below 0.001 count as equal."""
     return float(np.log((a + 1e-3) / (b + 1e-3)))
 
 

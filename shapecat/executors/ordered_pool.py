@@ -159,7 +159,7 @@ def _drop_finished(item: list[_Item], future: Future[_Result]) -> None:
 
 
 def _warm_up(_work: object, warm_up: Callable[[], object]) -> None:
-    """Warm up; unpickling the work has already imported its modules."""
+    """Call ``warm_up``. The work is an argument only because unpickling it imports its modules."""
     warm_up()
 
 

@@ -52,7 +52,7 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
 
     A point in column u satisfies x / z = (u - cx) / fx, so u is linear in x / z with slope fx and
     offset cx; the same holds for rows. The method fits two least-squares lines to a few thousand
-    points in double precision, first to medians, then without outliers.
+    points in double precision: first to the medians of bins, then to the points without outliers.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
     Returns
     -------
     The fit; None if there are fewer than about a hundred points, or they span less than a tenth of
-    the width or height, or no camera reprojects 95 % of them to within 0.6 pixels.
+    the width or height, or fewer than 95 % of them are within 0.6 pixels of the fitted camera.
     """
     height, width = points.shape[:2]
     sample = _sample(points)

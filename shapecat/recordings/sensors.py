@@ -44,17 +44,17 @@ class Stream:
         return self.kind == "points" or self.info_topic is not None
 
 
-class _Place(NamedTuple):
+class _TopicParts(NamedTuple):
     """The components of a topic.
 
     Attributes
     ----------
-    space : the namespace of the sensor.
+    namespace : that of the sensor.
     rest : the components after it.
     camera : words in ``rest``, except in its last component, that tell cameras apart.
     """
 
-    space: tuple[str, ...]
+    namespace: tuple[str, ...]
     rest: tuple[str, ...]
     camera: frozenset[str]
 
@@ -78,9 +78,9 @@ def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
     Streams with the same frame belong to the same sensor, unless the same driver seems to run in
     both namespaces, as on two robots of the same kind.
     """
-    places = {stream.topic: _place(stream.topic) for stream in streams}
+    places = {stream.topic: _split_topic(stream.topic) for stream in streams}
     instances = {
-        (places[a.topic].space, places[b.topic].space)
+        (places[a.topic].namespace, places[b.topic].namespace)
         for a, b in permutations(streams, 2)
         if _are_from_two_instances(a, b, places[a.topic], places[b.topic])
     }
@@ -89,7 +89,7 @@ def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
         first, second = places[a.topic], places[b.topic]
         one_frame = a.frame_id != "" and same_frame(a.frame_id, b.frame_id)
         return _share_namespace(first, second) or (
-            one_frame and (first.space, second.space) not in instances
+            one_frame and (first.namespace, second.namespace) not in instances
         )
 
     groups: list[list[Stream]] = []
@@ -100,23 +100,23 @@ def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
     return groups
 
 
-def _place(topic: str) -> _Place:
+def _split_topic(topic: str) -> _TopicParts:
     parts = tuple(topic.strip("/").split("/"))
     spaces = parts[:-1]
     ends = (k for k, part in enumerate(spaces) if any(word in part for word in _KINDS))
     end = next(ends, len(spaces))
     words = (word for part in parts[end:-1] for word in re.sub("_to_.*", "", part).split("_"))
-    return _Place(parts[:end], parts[end:], frozenset(words) - _PLAIN)
+    return _TopicParts(parts[:end], parts[end:], frozenset(words) - _PLAIN)
 
 
-def _share_namespace(a: _Place, b: _Place) -> bool:
-    if a.space != b.space or a.camera != b.camera:
+def _share_namespace(a: _TopicParts, b: _TopicParts) -> bool:
+    if a.namespace != b.namespace or a.camera != b.camera:
         return False
     # Without a namespace, a topic may belong to any sensor.
-    return a.space != () or all("depth" in "/".join(one.rest[:-1]) for one in (a, b))
+    return a.namespace != () or all("depth" in "/".join(one.rest[:-1]) for one in (a, b))
 
 
-def _are_from_two_instances(a: Stream, b: Stream, first: _Place, second: _Place) -> bool:
+def _are_from_two_instances(a: Stream, b: Stream, first: _TopicParts, second: _TopicParts) -> bool:
     """Return whether two streams seem to be from two instances of a driver, in two namespaces.
 
     Their topics are then the same after the namespace, but have different calibrations. Clouds have
@@ -124,8 +124,8 @@ def _are_from_two_instances(a: Stream, b: Stream, first: _Place, second: _Place)
     with the same first component (``/kinect2/hd``, ``/kinect2/qhd``) belong to one driver. If one
     namespace ends with the other, it holds a copy, such as throttled topics.
     """
-    short, long = sorted((first.space, second.space), key=len)
-    copied = first.space[:1] == second.space[:1] or long[len(long) - len(short) :] == short
+    short, long = sorted((first.namespace, second.namespace), key=len)
+    copied = first.namespace[:1] == second.namespace[:1] or long[len(long) - len(short) :] == short
     if first.rest != second.rest or copied:
         return False
     if a.kind == "depth":

@@ -52,9 +52,11 @@ def _at_rest(pose: Pose | None, other: Pose | None) -> bool:
 
 @kernel
 def _changed(depth: F4, key_depth: F4, range_m: float) -> bool:
-    """Return whether there is a square of compared pixels that all differ between two images.
+    """Return whether all pixels differ in some square of `_SQUARE` by `_SQUARE` compared pixels.
 
-    ``depth`` and ``key_depth`` are (h, w), metres, 0 where missing; ``range_m`` is the range.
+    Every `_STRIDE`-th pixel of every `_STRIDE`-th row is compared. A depth that a neighbouring
+    pixel of the other image has does not differ, and neither do depths that are both beyond
+    ``range_m``, metres. ``depth`` and ``key_depth`` are (h, w), metres, 0 where missing.
     """
     height, width = depth.shape
     rows = np.zeros(width, np.int64)  # consecutive rows with a long enough run that ends here

@@ -163,8 +163,8 @@ def write_frame(
 ) -> None:
     """Write the depth image, camera info and transforms of a frame.
 
-    The first frame also writes the static transforms. ``clouds`` and ``color`` are as for
-    `simulate`, but no colour image is written.
+    The first frame also writes the static transforms; with ``color``, the pose of the colour
+    camera is one of them. ``clouds`` is as for `simulate`.
 
     Raises
     ------

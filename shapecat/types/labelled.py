@@ -16,8 +16,9 @@ class LabelledObject(Record):
     Attributes
     ----------
     track : number of the track.
-    category, confidence : final: fused from all views of the track, or corrected by a person.
-    box, gas : box and surface of the visible part, sensor frame.
+    category, confidence : the final ones, fused from all views of the track or corrected by a
+        person.
+    box, gas : box of the visible part, and the graph of its surface; sensor frame.
     indices : (n,) ascending flat indices of its pixels or points in the frame.
     posterior : (c,) from this view alone.
     causal : (c,) fused from the track's views up to this frame.
@@ -78,8 +79,8 @@ class LabelledFrame(Record):
 class AnnotationBox(NamedTuple):
     """The annotation of one object, as plain numbers.
 
-    ``center``, ``size`` (metres) and ``orientation`` (x, y, z, w) are those of a `Box`, but in the
-    coordinate frame ``frame_id``.
+    ``center``, ``size`` (metres) and ``orientation`` (x, y, z, w) are those of a `Box`, but in
+    the coordinate frame `AnnotationFrame.frame_id`.
     """
 
     track: int

@@ -30,7 +30,7 @@ class Scenario:
                 relabel(case / "out" / "table" / "tracks.csv")
 
     def command(self, case: Path, *options: str) -> list[str]:
-        """Return the command for a case."""
+        """Return the command line for the case in folder ``case``; ``options`` are of `process`."""
         run = str(case / "out" / "table")
         if self.verb == "annotate":
             return [*SHAPECAT, "annotate", run]

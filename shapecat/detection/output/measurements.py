@@ -297,8 +297,9 @@ def _outer_points(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> tuple
 def _find_outer(labels: I4, i: int, first: int, end: int, outer: Bool) -> None:
     """Mark the labelled cells in part of row ``i`` that are next to other labels.
 
-    Labelled cells in every 4th row and column are marked too. ``labels`` is (rows, columns); the
-    part is from column ``first`` to before ``end``; the marks go to ``outer`` (columns,).
+    Labelled cells at the edge of the grid, and those whose row and column are multiples of 4, are
+    marked too. ``labels`` is (rows, columns); the part is from column ``first`` to before ``end``;
+    the marks go to ``outer`` (columns,).
     """
     rows, columns = labels.shape
     if i == 0 or i == rows - 1:

@@ -212,9 +212,10 @@ def _count_by_height(points: OrientedPoints, up: F8) -> F8:
 def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple[F4, F8]:
     """Find the samples on level surfaces in ``inv_depth`` (rows, columns); ``up`` (3,) is vertical.
 
-    At least three of the four neighbours of such a sample are closer to a level surface through it
-    than to a vertical one. Returns the columns, rows, inverse depths and heights (4, n) of the
-    samples, and the area of their surface at each height, (BINS,) m², the lowest first.
+    A sample is level if at least three of the four samples `ARM` cells away are closer to a level
+    surface through it than to a vertical one; every `COLUMN_STRIDE`-th column is tested. Returns
+    their columns, rows, inverse depths and heights above the sensor, metres, (4, n), and the area
+    of their surface in each band of height, (BINS,) m², the lowest first.
     """
     rows, columns = inv_depth.shape
     across, down = np.float32(up[0] / intrinsics.fx), np.float32(up[1] / intrinsics.fy)

@@ -52,7 +52,7 @@ class KittiLabels(Reference[str]):
         super().__init__(folder, names)
 
     def labelling(self, entry: str) -> Labelling:
-        """Return the objects of the label file with this name.
+        """Return the objects in the label file ``entry``.txt, without those of type DontCare.
 
         Raises
         ------

@@ -18,7 +18,7 @@ _LINE_LOOP = 2
 
 
 class ImageBox(NamedTuple):
-    """An object on an image; ``box`` is its left, top, width and height in pixels."""
+    """An object in an image; ``box`` is its left, top, width and height in pixels."""
 
     track: int
     category: str

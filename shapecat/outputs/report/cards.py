@@ -148,7 +148,10 @@ def _facts(card: Card) -> list[str]:
 
 
 def _bars(line: Timeline, categories: Sequence[str], row: TrackRow, names: Sequence[str]) -> str:
-    """Return a button for each category, the most likely first, with a bar for its posterior."""
+    """Return a button for each category, the most likely first, with a bar for its posterior.
+
+    ``categories`` and ``names`` are as in `card_html`.
+    """
     shares = dict(zip(categories, line.fused.tolist(), strict=False))
     order = sorted(shares, key=lambda name: -shares[name])
     if row.category not in shares and row.category != UNKNOWN:

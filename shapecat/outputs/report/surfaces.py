@@ -127,9 +127,9 @@ def _shade(spots: F8) -> U1:
     Points are drawn as discs, the nearest in front. The surface is lit from above left, with
     normals from the slopes of its smoothed nearness. ``spots`` is from `_project`.
     """
-    heights = _closed(_nearest(spots))
-    bare = ~np.isfinite(heights)
-    smooth = _smoothed(heights, bare)
+    nearness = _closed(_nearest(spots))
+    bare = ~np.isfinite(nearness)
+    smooth = _smoothed(nearness, bare)
     down, right = np.gradient(smooth)
     normal = np.stack([-right, down, np.ones_like(right)], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -145,22 +145,25 @@ def _nearest(spots: F8) -> F8:
     radius = float(np.clip(0.9 * np.sqrt(area / len(spots)), 1.0, 4.5))
     columns, rows = np.round(spots[:, :2].T).astype(int)
     inside = (columns >= 0) & (columns < SIDE) & (rows >= 0) & (rows < SIDE)
-    heights = np.full((SIDE, SIDE), -np.inf)
-    np.maximum.at(heights, (rows[inside], columns[inside]), spots[inside, 2])
+    nearness = np.full((SIDE, SIDE), -np.inf)
+    np.maximum.at(nearness, (rows[inside], columns[inside]), spots[inside, 2])
     steps = np.arange(-int(radius) - 1, int(radius) + 2)
     disc = np.hypot(steps[:, None], steps) <= radius
-    widened = ndimage.maximum_filter(heights, footprint=disc, mode="constant", cval=-np.inf)
+    widened = ndimage.maximum_filter(nearness, footprint=disc, mode="constant", cval=-np.inf)
     return np.asarray(widened)
 
 
-def _closed(heights: F8) -> F8:
-    """Return ``heights`` (h, w) with the empty pixels filled that the object mostly surrounds."""
+def _closed(nearness: F8) -> F8:
+    """Fill the empty pixels that the object mostly surrounds with the mean of their neighbours.
+
+    ``nearness`` (h, w) is from `_nearest`; empty pixels are -inf.
+    """
     for _ in range(_PASSES):
-        solid = np.isfinite(heights)
+        solid = np.isfinite(nearness)
         share = _blurred(solid.astype(np.float64))
-        mean = _blurred(np.where(solid, heights, 0.0)) / np.maximum(share, 1e-9)
-        heights = np.where(~solid & (share > 0.5), mean, heights)
-    return heights
+        mean = _blurred(np.where(solid, nearness, 0.0)) / np.maximum(share, 1e-9)
+        nearness = np.where(~solid & (share > 0.5), mean, nearness)
+    return nearness
 
 
 def _smoothed(heights: F8, bare: Bool) -> F8:

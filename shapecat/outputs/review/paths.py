@@ -19,7 +19,7 @@ _POINTS = 500
 
 @dataclass
 class _Path:
-    """The positions (3,) of a track so far, metres."""
+    """The category of a track, and its latest positions (3,), metres."""
 
     category: str
     places: list[F8] = field(default_factory=list)
@@ -42,7 +42,7 @@ class Paths:
     """The paths of tracks, by Rerun entity; an entity is rewritten when its paths grow or end."""
 
     def __init__(self, columns: Columns) -> None:
-        """Start without paths."""
+        """Start without paths; those that grow or end are written to ``columns``."""
         self._columns = columns
         self._paths: dict[str, dict[int, _Path]] = {}
 

@@ -297,7 +297,7 @@ class _Review:
 
 @cache
 def _count(category: str, sensor: str) -> Drawing:
-    """Return the drawing of a count, in steps; ``category + sensor`` is the name of the line."""
+    """Return the step plot of a count; ``category + sensor`` is the name of its line."""
     style = rr.SeriesLines(
         names=category + sensor,
         colors=colour_of(category),

@@ -66,7 +66,10 @@ class TransformLoopError(TransformError):
 
 
 class TransformBuffer:
-    """Transforms between frames; static ones are valid when their child frame has no other."""
+    """Transforms between frames.
+
+    A static transform is used at times when its child frame has no other transform.
+    """
 
     def __init__(self) -> None:
         """Make an empty buffer."""
@@ -133,7 +136,7 @@ class TransformBuffer:
             track.latched |= latched
             track.add(stamp_ns, sample)
             if log_time_ns is not None:
-                track.note(log_time_ns, stamp_ns, sample)
+                track.note_delay(log_time_ns, stamp_ns, sample)
         return True
 
     @property

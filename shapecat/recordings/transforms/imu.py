@@ -69,7 +69,7 @@ class Accelerometers:
         return bool(self._found)
 
     def around(self, log_time_ns: int, stamp_ns: int) -> list[Accelerometer]:
-        """Return the accelerometers, sorted by topic, for a frame with this log time and stamp."""
+        """Return the accelerometers, sorted by topic, with what they measured around a frame."""
         self._ahead.advance(log_time_ns, stamp_ns)
         return [self._found[topic] for topic in sorted(self._found)]
 

@@ -125,8 +125,8 @@ class TransformTrack:
         else:
             self._set(slice(at, at), stamp, sample)
 
-    def note(self, log_time_ns: int, stamp_ns: int, sample: TransformSample) -> None:
-        """Add the delay of a sample; if the delay is kept, update ``moves``."""
+    def note_delay(self, log_time_ns: int, stamp_ns: int, sample: TransformSample) -> None:
+        """Add the delay of a sample. `delays` keeps only some; with those, update ``moves``."""
         if self.delays.add(log_time_ns, stamp_ns) and not self.moves:
             self._first = self._first or sample
             self.moves = not are_close(self._first, sample)

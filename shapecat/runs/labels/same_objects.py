@@ -68,15 +68,15 @@ def match_in_time(source: Path, target: Path, group: Group) -> Matches | None:
     group : returns the same number for tracks of the source that a person merged.
     """
     old, new = read_track_detections(source), read_track_detections(target)
-    common = sorted(old.keys.keys() & new.keys.keys())
-    if not common and old.keys and new.keys:
+    common = sorted(old.rows.keys() & new.rows.keys())
+    if not common and old.rows and new.rows:
         return None
     old_widths, new_widths = _widths(source, old), _widths(target, new)
     votes: Counter[tuple[int, int]] = Counter()
     apart: defaultdict[tuple[int, int], float] = defaultdict(float)
     counts: Counter[int] = Counter()
     for key in common:
-        here, there = old.keys[key], new.keys[key]
+        here, there = old.rows[key], new.rows[key]
         counts.update(new.tracks[there].tolist())
         max_distance = _max_distance_at_once(old_widths[here], new_widths[there])
         for a, b, distance in _mutual_nearest(old.centers[here], new.centers[there], max_distance):

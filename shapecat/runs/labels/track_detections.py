@@ -26,18 +26,18 @@ class TrackDetections(NamedTuple):
 
     Attributes
     ----------
-    tracks, numbers, detections : (n,) track, frame and detection numbers.
-    frames : the `_Moment` of each detection.
+    tracks, frames, detections : (n,) track, frame and detection numbers.
+    moments : the `_Moment` of each detection.
     centers : (n, 3) metres, in the fixed frame, or the sensor frame if there is none.
-    keys : the rows of each `_Moment`.
+    rows : the slice of the rows of each `_Moment`.
     """
 
     tracks: I4
-    frames: list[_Moment]
-    numbers: I4
+    moments: list[_Moment]
+    frames: I4
     detections: I4
     centers: F8
-    keys: dict[_Moment, slice]
+    rows: dict[_Moment, slice]
 
 
 def read_track_detections(folder: Path) -> TrackDetections:
@@ -47,17 +47,17 @@ def read_track_detections(folder: Path) -> TrackDetections:
         table = file.read(columns=columns)
     table = table.sort_by([(name, "ascending") for name in ("topic", "stamp_ns", "frame")])
     seen = table["detection"].is_valid()
-    keys = list(compress(_moments(table), seen.to_pylist()))
+    moments = list(compress(_moments(table), seen.to_pylist()))
     table = table.filter(seen)
-    starts = [k for k, key in enumerate(keys) if not k or key != keys[k - 1]]
-    rows = map(slice, starts, [*starts[1:], len(keys)])
+    starts = [k for k, moment in enumerate(moments) if not k or moment != moments[k - 1]]
+    rows = map(slice, starts, [*starts[1:], len(moments)])
     return TrackDetections(
         numbers(table["track"]),
-        keys,
+        moments,
         numbers(table["frame"]),
         numbers(table["detection"]),
         numbers(table["center_fixed"]).reshape(-1, 3).astype(np.float64),
-        dict(zip((keys[k] for k in starts), rows, strict=True)),
+        dict(zip((moments[k] for k in starts), rows, strict=True)),
     )
 
 
@@ -81,7 +81,7 @@ def extents_of(folder: Path, tracks: TrackDetections) -> dict[int, tuple[float, 
     for track in np.unique(tracks.tracks):
         rows = np.flatnonzero(tracks.tracks == track)
         for row in rows[:: max(1, len(rows) // _SAMPLES)].tolist():
-            rows_of.setdefault((tracks.frames[row][0], int(tracks.numbers[row])), []).append(row)
+            rows_of.setdefault((tracks.moments[row][0], int(tracks.frames[row])), []).append(row)
     sizes: dict[int, list[F4]] = {}
     for group in read_row_groups(folder / "detections.parquet", ["topic", "frame", "size"]):
         size = numbers(group["size"]).reshape(-1, 3)

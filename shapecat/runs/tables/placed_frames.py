@@ -86,7 +86,7 @@ def streams_with_poses(folder: Path) -> set[str]:
 
 
 def count_poses(folder: Path) -> dict[str, tuple[int, int]]:
-    """Return, by topic, the number of frames with a known sensor pose and that of all frames."""
+    """Return, by topic, how many frames have a known sensor pose, and how many there are."""
     has_pose = read_by_topic(
         folder,
         ["fixed_translation"],

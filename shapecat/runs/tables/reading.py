@@ -295,7 +295,7 @@ def with_fixed_lists(table: pa.Table) -> pa.Table:
 
 
 def _open_parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
-    """Open a file; the columns ``read_dictionary`` are read as dictionaries."""
+    """Open a file; the columns ``read_dictionary`` stay dictionary-encoded."""
     try:
         return pq.ParquetFile(
             path, read_dictionary=list(read_dictionary), page_checksum_verification=True

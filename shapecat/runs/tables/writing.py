@@ -64,9 +64,10 @@ def rows_as_lists(values: F4) -> pa.Array:
 
 
 class _Writer(pq.ParquetWriter):  # type: ignore[misc]  # pyarrow has no types
-    """Writes row groups; lists of fixed size that may be null are written as plain lists.
+    """Writes row groups with the column types of its schema, whatever those of the tables.
 
-    Arrow before version 26, and programs that use it, cannot read nulls among lists of fixed size.
+    `open_writer` replaces lists of fixed size that may be null by plain lists: Arrow before version
+    26, and programs that use it, cannot read nulls among lists of fixed size.
     """
 
     def write_table(self, table: pa.Table) -> None:

@@ -39,7 +39,7 @@ class Image(Record):
     ----------
     inverse : (h, w) inverse of the depth along the optical axis, 1/m; 0 without surface.
     mesh_ids : (h, w) index of the visible mesh, -1 without surface.
-    cosine : (h, w) cosine of the angle between the ray and the surface normal; 0 without surface.
+    cosine : (h, w) cosine of the angle of incidence, at least 0; 0 without surface.
     """
 
     inverse: F8 = array("h w", "f8")
