@@ -15,7 +15,7 @@ from shapecat.evaluation import metrics
 from shapecat.evaluation.report import Compared
 from shapecat.evaluation.training import fit_views
 from shapecat.evaluation.views import DescribedViews
-from shapecat.system.progress import Observer, ignore
+from shapecat.system.progress import Observer, ignore, observed
 from shapecat.types import UNKNOWN
 
 __all__ = ["compare_learners"]
@@ -64,11 +64,10 @@ def compare_learners(
         raise RecordingError(msg)
     learners = _learners()
     rows = []
-    for k, (name, learner) in enumerate(learners.items(), start=1):
+    for name, learner in observed(learners.items(), "baselines", len(learners), observe):
         truth, posteriors = _predict_all(learner, splits, categories)
         learned = _mean_views(splits, with_unknown=learner is _learn_shapecat)
         rows.append(_compared(name, learned, truth, posteriors))
-        observe("baselines", k, len(learners))
     return tuple(rows)
 
 

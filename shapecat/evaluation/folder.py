@@ -11,9 +11,9 @@ from shapecat.evaluation.baselines import compare_learners
 from shapecat.evaluation.dataset import Dataset, read_dataset
 from shapecat.evaluation.names import require_category_names
 from shapecat.evaluation.report import Report, evaluate, require_categories
-from shapecat.evaluation.views import DescribedViews, describe_views
+from shapecat.evaluation.views import describe_views
 from shapecat.learning import load_model
-from shapecat.system.progress import Observer, ignore
+from shapecat.system.progress import Observer, ignore, observed
 
 __all__ = ["evaluate_folder"]
 
@@ -46,10 +46,13 @@ def evaluate_folder(
     dataset = read_dataset(root)
     require_category_names(root, dataset.categories, categorizer.categories)
     require_categories(dataset.categories, categorizer)
-    with_baselines = baselines is not None
     if baselines is not None and baselines.resolve() != root.resolve():
         _require_other_views(dataset, root, baselines)
-    views = _described(dataset, "evaluate", observe, with_functions=with_baselines)
+    views = describe_views(
+        observed(dataset, "evaluate", len(dataset), observe),
+        settings=Settings(),
+        with_functions=baselines is not None,
+    )
     report = evaluate(views, categorizer)
     if baselines is None:
         return report
@@ -58,7 +61,12 @@ def evaluate_folder(
         raise RecordingError(msg)
     train = None
     if baselines.resolve() != root.resolve():
-        train = _described(read_dataset(baselines), "train", observe, with_functions=True)
+        others = read_dataset(baselines)
+        train = describe_views(
+            observed(others, "train", len(others), observe),
+            settings=Settings(),
+            with_functions=True,
+        )
     rows = compare_learners(
         views, train, categories=categorizer.categories, root=baselines, observe=observe
     )
@@ -87,16 +95,3 @@ def _digest(path: Path) -> bytes:
     """Return a hash of the content of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "blake2b").digest()
-
-
-def _described(
-    dataset: Dataset, phase: str, observe: Observer, *, with_functions: bool
-) -> DescribedViews:
-    return describe_views(
-        dataset,
-        settings=Settings(),
-        total=len(dataset),
-        phase=phase,
-        observe=observe,
-        with_functions=with_functions,
-    )

@@ -20,7 +20,7 @@ from shapecat.learning.categorizer import MOST_CATEGORIES
 from shapecat.learning.incremental import add_categories
 from shapecat.learning.training import Examples, LearningSettings, fit_categorizer
 from shapecat.runs.labels.meaning import order_categories
-from shapecat.system.progress import Observer, ignore
+from shapecat.system.progress import Observer, ignore, observed
 from shapecat.types import UNKNOWN
 
 __all__ = [
@@ -177,9 +177,7 @@ def _describe_folder(
         msg = f"{root}: a model can have {MOST_CATEGORIES} categories, not {count}"
         raise ModelError(msg)
     settings = replace(Settings(), seed=seed)
-    views = describe_views(
-        dataset, settings=settings, total=len(dataset), phase="train", observe=observe
-    )
+    views = describe_views(observed(dataset, "train", len(dataset), observe), settings=settings)
     folders = {*dataset.categories, *dataset.without_views}
     return views, sorted(folders - set(views.labels.tolist()))
 

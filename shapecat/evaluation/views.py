@@ -12,7 +12,6 @@ from shapecat.description import DESCRIPTOR_NAMES, describe
 from shapecat.evaluation.dataset import View
 from shapecat.evaluation.shape_functions import shape_functions
 from shapecat.surface import reconstruct, thin
-from shapecat.system.progress import Observer, ignore
 
 __all__ = ["DescribedViews", "describe_view", "describe_views"]
 
@@ -80,17 +79,12 @@ def describe_views(
     views: Iterable[View],
     *,
     settings: Settings,
-    total: int | None = None,
-    phase: str = "describe",
-    observe: Observer = ignore,
     with_functions: bool = False,
 ) -> DescribedViews:
     """Describe each view; the generator of view k, counted from 1, has the seed (settings.seed, k).
 
     Parameters
     ----------
-    total : number of views, for ``observe``; None if unknown.
-    phase : name of the phase, for ``observe``.
     with_functions : whether to compute shape distributions too.
     """
     described_views: list[tuple[DescribedView, str, str, float, float]] = []
@@ -111,7 +105,6 @@ def describe_views(
             if with_functions:
                 rng = np.random.default_rng((settings.seed, count, 1))
                 functions.append(shape_functions(view.points, rng))
-        observe(phase, count, total)
     return DescribedViews(
         descriptors=np.array([item[0].descriptor for item in described_views], np.float32).reshape(
             len(described_views), len(DESCRIPTOR_NAMES)

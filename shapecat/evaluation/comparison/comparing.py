@@ -37,7 +37,7 @@ from shapecat.runs.finished import FinishedRun, open_source
 from shapecat.runs.perceive.selection import read_frames
 from shapecat.runs.run_info import Options
 from shapecat.runs.tables.reading import Key
-from shapecat.system.progress import Observer, ignore
+from shapecat.system.progress import Observer, ignore, observed
 from shapecat.types import UNKNOWN, Frame
 
 __all__ = ["Comparison", "compare"]
@@ -105,16 +105,16 @@ def compare(
         recorded_frames, notes = _recorded_frames(finished, recording, stack)
         notes += numbering_notes(other, finished.info["options"]["start_s"])
         total = int(finished.info["counts"]["frames"])
-        for done, (key, row, found) in enumerate(run_labellings(finished), start=1):
+        labellings = observed(run_labellings(finished), "compare", total, observe)
+        for done, (key, row, found) in enumerate(labellings):
             place = (row["topic"], row["stamp_ns"])
             true = other.at(key, row["stamp_ns"], repeated=place in repeated)
             if true is None:
                 tally.only_run += 1
             else:
                 _compare_frame(
-                    tally, key, row, found, true, recorded_frames, (done - 1) * _PICTURES // total
+                    tally, key, row, found, true, recorded_frames, done * _PICTURES // total
                 )
-            observe("compare", done, total)
     if not tally.frames:
         raise RecordingError(_nothing_in_common(finished, reference, other))
     if _hardly_matches(tally.rows):

@@ -27,7 +27,7 @@ from shapecat.runs.labels.corrections import read_labelled_table
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.labels.track_table import TrackTable
 from shapecat.system.files import replacing
-from shapecat.system.progress import Observer, ignore
+from shapecat.system.progress import Observer, ignore, observed
 
 __all__ = ["INDEX", "PAGE", "Reports", "RunReport", "read_report", "read_reports"]
 
@@ -206,12 +206,11 @@ def read_reports(folders: Sequence[Path], observe: Observer = ignore) -> Reports
     indexed = len(runs) > 1 or any(folder not in runs for folder in folders)
     index = _above(runs) / INDEX
     reports, failed = [], {}
-    for done, run in enumerate(runs, start=1):
+    for run in observed(runs, "report", len(runs), observe):
         try:
             reports.append(read_report(run, index=_link(_place(run), index) if indexed else None))
         except OutputError as error:
             failed[run] = error
-        observe("report", done, len(runs))
     return Reports(reports, indexed, failed)
 
 
