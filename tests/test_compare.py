@@ -7,7 +7,7 @@ import re
 import runpy
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -29,8 +29,7 @@ from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.comparison import comparing
 from shapecat.evaluation.comparison.comparing import (
     Comparison,
-    _compare_frame,
-    _kind,
+    _ComparedFrames,
     compare,
 )
 from shapecat.evaluation.comparison.figures import Tally, figures_of
@@ -338,12 +337,28 @@ def test_table_lists_every_difference_once(shapecat: Run, run: Path, truth: Path
     assert "the recording is missing" in result.stderr
 
 
+def differences(pairs: Sequence[tuple[LabelledItem, LabelledItem]]) -> list[str | None]:
+    """Return the difference of the found and the true object in each frame."""
+    compared = _ComparedFrames(iter(()))
+    for k, (found, true) in enumerate(pairs):
+        compared.add(("/d", k), START + k, Labelling((found,)), Labelling((true,)), 0)
+    return [row.difference for row in compared.tally.rows]
+
+
 def test_identity_switch_is_counted_once() -> None:
     """After the frame of the switch, the new track counts as the object's own."""
-    tally, cup = Tally(), LabelledItem(11, "cup")
-    kinds = [_kind(tally, LabelledItem(track, "cup"), cup, 0.9) for track in (5, 5, 6, 6, 6, 5, 5)]
+    cup = LabelledItem(11, "cup", np.array(CUP))
+    tracks = (5, 5, 6, 6, 6, 5, 5)
 
-    assert kinds == [None, None, "identity", None, None, "identity", None]
+    assert differences([(LabelledItem(track, "cup", cup.pixels), cup) for track in tracks]) == [
+        None,
+        None,
+        "identity",
+        None,
+        None,
+        "identity",
+        None,
+    ]
 
 
 @pytest.mark.parametrize("other", [(6, "can"), (None, "cup"), (None, "can")])
@@ -354,15 +369,13 @@ def test_identity_switch_is_not_counted_beside_another_difference(
 
     Only the tracking metrics count it then. A detection without a track is not a switch.
     """
-    tally, cup = Tally(), LabelledItem(11, "cup")
+    cup = LabelledItem(11, "cup", np.array(CUP))
     track, category = other
-    before = _kind(tally, LabelledItem(5, "cup"), cup, 0.9)
-    kind = _kind(tally, LabelledItem(track, category), cup, 0.9)
-    after = [_kind(tally, LabelledItem(track or 5, "cup"), cup, 0.9) for _ in range(2)]
+    later = [(track or 5, "cup")] * 2
+    found = [LabelledItem(*item, cup.pixels) for item in ((5, "cup"), other, *later)]
+    kinds = differences([(item, cup) for item in found])
 
-    assert before is None
-    assert kind == (None if category == "cup" else "category")
-    assert after == [None, None]
+    assert kinds == [None, None if category == "cup" else "category", None, None]
 
 
 def test_page_has_each_metric_in_its_place(run: Path, truth: Path) -> None:
@@ -416,9 +429,7 @@ def worked() -> Comparison:
     captions = (
         Caption(20.0, 150.4, "left"), Caption(290.0, 4.0, "high"), Caption(144.0, 60.0, "in")
     )  # fmt: skip
-    picture = DifferenceImage(
-        "/d", 9, "data:image/png;base64,AA", 300, 200, captions, 3.5, rows[5:]
-    )
+    picture = DifferenceImage("/d", 9, "data:image/png;base64,AA", 300, 200, captions, rows[5:])
     taken_for = [
         {"true": true, "label": label, "n": n}
         for true, label, n in (
@@ -727,21 +738,21 @@ def test_labels_of_images_with_another_size_are_refused(side: int, depth: bool) 
     with pytest.raises(
         RecordingError, match=rf"{side} x {side} pixels.*another recording.*--depth"
     ):
-        _compare_frame(Tally(), ("/d", 0), {"stamp_ns": START}, found, true, frames, 0)
+        _ComparedFrames(frames).add(("/d", 0), START, found, true, 0)
 
 
 def test_picture_of_each_part_shows_its_worst_frame() -> None:
     """Of the frames in a twelfth of the run, the one with most differences is shown."""
     masks = np.arange(0, 20), np.arange(40, 90)
-    tally = Tally()
+    compared = _ComparedFrames(iter(()))
     for k, names in enumerate((("can", "cup"), ("can", "can"), ("cup", "can"))):
         true = tuple(LabelledItem(j, "cup", mask) for j, mask in enumerate(masks))
         found = tuple(LabelledItem(j, name, masks[j]) for j, name in enumerate(names))
         both = Labelling(found), Labelling(true, None, (10, 10))
-        _compare_frame(tally, ("/d", 7 + k), {"stamp_ns": k}, *both, iter(()), 5)
+        compared.add(("/d", 7 + k), k, *both, 5)
 
-    assert list(tally.pictures) == [5]
-    assert (tally.pictures[5].frame, len(tally.pictures[5].rows)) == (8, 2)
+    (picture,) = compared.pictures()
+    assert (picture.frame, len(picture.rows)) == (8, 2)
 
 
 def half_spaces(box: Box) -> np.ndarray:
@@ -1472,7 +1483,7 @@ def test_split_object_is_visible_in_the_picture() -> None:
     halves = (LabelledItem(5, "can", np.arange(0, 40)), LabelledItem(6, "cup", np.arange(40, 70)))
     head = ("/d", 0, START)
     rows = [Difference(*head, "category", category="can"), Difference(*head, "surplus")]
-    picture = draw_frame(("/d", 0), None, Labelling(halves), true, {0: 0}, rows, 2.0)
+    picture = draw_frame(("/d", 0), None, Labelling(halves), true, {0: 0}, rows)
 
     assert picture is not None
     content = base64.b64decode(picture.image.split(",")[1])
@@ -1497,7 +1508,7 @@ def test_tint_of_object_shows_its_own_difference() -> None:
         Difference("/d", 0, START, None),
     ]
     shape = Labelling(true.items, None, (10, 10))
-    picture = draw_frame(("/d", 0), None, found, shape, {0: 1, 1: 0}, rows, 1.0)
+    picture = draw_frame(("/d", 0), None, found, shape, {0: 1, 1: 0}, rows)
 
     assert picture is not None
     content = base64.b64decode(picture.image.split(",")[1])

@@ -96,33 +96,29 @@ def compare(
     RecordingError : the reference cannot be read, or has no frame in common with the run.
     """
     finished = read_complete(folder)
-    digest = finished.info["input"]["digest"]
-    other = open_reference(reference, finished.categories, finished.name, digest)
+    other = open_reference(
+        reference, finished.categories, finished.name, finished.info["input"]["digest"]
+    )
     if isinstance(other, OtherRun):
         _require_same_recording(finished, other)
-    tally, repeated = Tally(), repeated_stamps(folder)
+    only_run, repeated = 0, repeated_stamps(folder)
+    total = int(finished.info["counts"]["frames"])
     with ExitStack() as stack:
         recorded_frames, notes = _recorded_frames(finished, recording, stack)
-        notes += numbering_notes(other, finished.info["options"]["start_s"])
-        total = int(finished.info["counts"]["frames"])
+        compared = _ComparedFrames(recorded_frames)
         labellings = observed(run_labellings(finished), "compare", total, observe)
         for done, (key, row, found) in enumerate(labellings):
             place = (row["topic"], row["stamp_ns"])
             true = other.at(key, row["stamp_ns"], repeated=place in repeated)
             if true is None:
-                tally.only_run += 1
+                only_run += 1
             else:
-                _compare_frame(
-                    tally, key, row, found, true, recorded_frames, done * _PICTURES // total
-                )
+                compared.add(key, row["stamp_ns"], found, true, done * _PICTURES // total)
+    tally, categories = compared.tally, finished.info["model"]["categories"]
     if not tally.frames:
         raise RecordingError(_nothing_in_common(finished, reference, other))
-    if _hardly_matches(tally.rows):
-        notes.append(
-            f"Hardly any object matches: is {reference} from the same recording? Labels of images "
-            "must be of its depth images (--format coco --depth)."
-        )
-    categories = finished.info["model"]["categories"]
+    notes += numbering_notes(other, finished.info["options"]["start_s"])
+    notes += _doubts(tally.rows, reference)
     notes += _categories_left_out(tally, categories)
     return Comparison(
         run=str(folder),
@@ -131,13 +127,13 @@ def compare(
         figures={
             "frames": {
                 "compared": tally.frames,
-                "only_in_run": tally.only_run,
+                "only_in_run": only_run,
                 "only_in_reference": max(other.frames - tally.frames, 0),
             },
             **figures_of(tally, categories, tracked=other.tracked),
         },
         rows=tuple(tally.rows),
-        pictures=tuple(tally.pictures[k] for k in sorted(tally.pictures)),
+        pictures=compared.pictures(),
         notes=tuple(notes),
     )
 
@@ -158,11 +154,20 @@ def _nothing_in_common(finished: FinishedRun, reference: Path, other: Reference[
     )
 
 
-def _hardly_matches(rows: Sequence[Difference]) -> bool:
-    """Return whether run and reference both have unmatched objects, but hardly any matched ones."""
+def _doubts(rows: Sequence[Difference], reference: Path) -> list[str]:
+    """Return a list with a note if the reference may be from another recording.
+
+    Then run and reference both have unmatched objects, but hardly any matched ones.
+    """
     found, true = (Counter(row.difference for row in rows)[kind] for kind in ("surplus", "missed"))
     matched = len(rows) - found - true
-    return min(found, true) > 0 and matched < _DOUBTFUL * (matched + min(found, true))
+    if not min(found, true) or matched >= _DOUBTFUL * (matched + min(found, true)):
+        return []
+    note = (
+        f"Hardly any object matches: is {reference} from the same recording? Labels of images "
+        "must be of its depth images (--format coco --depth)."
+    )
+    return [note]
 
 
 def _categories_left_out(tally: Tally, categories: Sequence[str]) -> list[str]:
@@ -193,34 +198,103 @@ def _recorded_frames(
         return iter(()), [f"The pictures lack depth: {error}"]
 
 
-def _compare_frame(
-    tally: Tally,
-    key: Key,
-    row: Mapping[str, Any],
-    found: Labelling,
-    true: Labelling,
-    recorded_frames: Iterator[Frame],
-    part: int,
-) -> None:
-    """Match the objects of a frame, and count agreements and differences in ``tally``.
+class _ComparedFrames:
+    """Counts over the compared frames, and a picture of each part of the run.
 
-    ``row`` is the frame's row in the table of the run; ``recorded_frames`` yields the frames of the
-    recording. Keep a picture of the frame if it differs more than all earlier frames in its part of
-    the run, number ``part``.
+    Attributes
+    ----------
+    tally : the counts.
     """
-    frame = next((f for f in recorded_frames if (f.topic, f.index) == key), None)
-    _require_same_size(found, true, frame, key)
-    found = labelled_part(found, true)
-    matched = match_objects(found.items, true.items)
-    rows = list(_differences(tally, key, row["stamp_ns"], found.items, true.items, matched))
-    tally.add(found.items, true.items, matched, rows)
-    differing = [item for item in rows if item.difference]
-    severity = len(differing) + 1 - float(np.mean([item.iou or 0 for item in rows] or [1]))
-    best = tally.pictures.get(part)
-    if differing and (best is None or severity > best.severity):
-        picture = draw_frame(key, frame, found, true, matched.pairs, rows, severity)
-        if picture is not None:
-            tally.pictures[part] = picture
+
+    def __init__(self, recorded_frames: Iterator[Frame]) -> None:
+        """Begin with the frames of the recording, of which the pictures show the depth."""
+        self.tally = Tally()
+        self._recorded_frames = recorded_frames
+        self._last_tracks: dict[int, int] = {}  # by true track, the track last matched with it
+        self._worst: dict[int, tuple[float, DifferenceImage]] = {}  # by part, with its severity
+
+    def pictures(self) -> tuple[DifferenceImage, ...]:
+        """Return pictures of the frames that differ most, in the order of the run."""
+        return tuple(self._worst[part][1] for part in sorted(self._worst))
+
+    def add(self, key: Key, stamp_ns: int, found: Labelling, true: Labelling, part: int) -> None:
+        """Match the objects of a frame, and count agreements and differences.
+
+        Keep a picture of the frame if it differs more than all earlier frames in its part of the
+        run, number ``part``.
+
+        Raises
+        ------
+        RecordingError : the labels are for an image of another size.
+        """
+        frame = next((f for f in self._recorded_frames if (f.topic, f.index) == key), None)
+        _require_same_size(found, true, frame, key)
+        found = labelled_part(found, true)
+        matched = match_objects(found.items, true.items)
+        rows = list(self._rows((*key, stamp_ns), found.items, true.items, matched))
+        self.tally.add(found.items, true.items, matched, rows)
+        differing = sum(row.difference is not None for row in rows)
+        severity = differing + 1 - float(np.mean([row.iou or 0 for row in rows] or [1]))
+        if differing and (part not in self._worst or severity > self._worst[part][0]):
+            picture = draw_frame(key, frame, found, true, matched.pairs, rows)
+            if picture is not None:
+                self._worst[part] = severity, picture
+
+    def _rows(
+        self,
+        head: tuple[str, int, int],
+        found: Sequence[LabelledItem],
+        true: Sequence[LabelledItem],
+        matched: Matched,
+    ) -> Iterator[Difference]:
+        """Yield the rows of a frame: matched pairs and surplus objects, then missed objects.
+
+        ``head`` is the topic, the number and the timestamp of the frame.
+        """
+        for i, a in enumerate(found):
+            if i not in matched.pairs:
+                yield Difference(
+                    *head, "surplus", track=a.track, category=a.category, confidence=a.confidence
+                )
+                continue
+            b, j = true[matched.pairs[i]], matched.pairs[i]
+            f = None if matched.f is None else float(matched.f[i, j])
+            yield Difference(
+                *head,
+                _difference(a, b, f, switched=self._follow(a, b)),
+                true_track=b.track,
+                true_category=b.category,
+                track=a.track,
+                category=a.category,
+                confidence=a.confidence,
+                f=f,
+                iou=None if f is None else float(matched.similarity[i, j]),
+                box_iou=item_box_iou(a, b),
+            )
+        for j, b in enumerate(true):
+            if j not in matched.pairs.values():
+                yield Difference(*head, "missed", true_track=b.track, true_category=b.category)
+
+    def _follow(self, a: LabelledItem, b: LabelledItem) -> bool:
+        """Note which track the true object ``b`` has now; return whether it had another before."""
+        if a.track is None or b.track is None:
+            return False
+        before = self._last_tracks.get(b.track, a.track)
+        self._last_tracks[b.track] = a.track
+        return before != a.track
+
+
+def _difference(a: LabelledItem, b: LabelledItem, f: float | None, *, switched: bool) -> str | None:
+    """Return the most serious difference of a pair, None if there is none.
+
+    ``a`` is the found object, ``b`` the true one, ``f`` the overlap F of their masks; ``switched``
+    says whether ``b`` had another track before.
+    """
+    if b.decidable and a.category != b.category:
+        return "category"
+    if switched:
+        return "identity"
+    return "outline" if f is not None and f < MATCHED_F else None
 
 
 def _require_same_size(found: Labelling, true: Labelling, frame: Frame | None, key: Key) -> None:
@@ -249,57 +323,3 @@ def _require_same_size(found: Labelling, true: Labelling, frame: Frame | None, k
         "(--format coco --depth)"
     )
     raise RecordingError(msg)
-
-
-def _differences(
-    tally: Tally,
-    key: Key,
-    stamp_ns: int,
-    found: Sequence[LabelledItem],
-    true: Sequence[LabelledItem],
-    matched: Matched,
-) -> Iterator[Difference]:
-    """Yield the rows of a frame: matched pairs and surplus objects, then missed objects."""
-    head = (*key, stamp_ns)
-    for i, a in enumerate(found):
-        if i not in matched.pairs:
-            yield Difference(
-                *head, "surplus", track=a.track, category=a.category, confidence=a.confidence
-            )
-            continue
-        b, j = true[matched.pairs[i]], matched.pairs[i]
-        f = None if matched.f is None else float(matched.f[i, j])
-        iou = None if f is None else float(matched.similarity[i, j])
-        kind = _kind(tally, a, b, f)
-        yield Difference(
-            *head,
-            kind,
-            true_track=b.track,
-            true_category=b.category,
-            track=a.track,
-            category=a.category,
-            confidence=a.confidence,
-            f=f,
-            iou=iou,
-            box_iou=item_box_iou(a, b),
-        )
-    for j, b in enumerate(true):
-        if j not in matched.pairs.values():
-            yield Difference(*head, "missed", true_track=b.track, true_category=b.category)
-
-
-def _kind(tally: Tally, a: LabelledItem, b: LabelledItem, f: float | None) -> str | None:
-    """Return the most serious difference of a pair, None if there is none.
-
-    ``a`` is the found object, ``b`` the true one, ``f`` the overlap F of their masks. Notes the
-    track of ``a`` in ``tally.last_tracks``.
-    """
-    switched = False
-    if a.track is not None and b.track is not None:
-        switched = tally.last_tracks.get(b.track, a.track) != a.track
-        tally.last_tracks[b.track] = a.track
-    if b.decidable and a.category != b.category:
-        return "category"
-    if switched:
-        return "identity"
-    return "outline" if f is not None and f < MATCHED_F else None

@@ -16,7 +16,6 @@ from shapecat.evaluation.comparison.matching import (
     frame_identities,
 )
 from shapecat.evaluation.comparison.overlap import Matched, Overlap
-from shapecat.evaluation.comparison.pictures import DifferenceImage
 from shapecat.evaluation.metrics import expected_calibration_error
 
 __all__ = ["Tally", "figures_of"]
@@ -43,9 +42,6 @@ class Tally:
     frames : number of compared frames.
     masks : whether all objects of all frames have masks.
     pairs : the matched objects, without ambiguous ones.
-    last_tracks : for each true track, the track that was last matched with it.
-    pictures : the frame that differs most in each part of the run, by the number of the part.
-    only_run : number of frames that the reference lacks.
     """
 
     frames: int = 0
@@ -54,9 +50,6 @@ class Tally:
     pairs: list[Pair] = field(default_factory=list)
     identities: list[FrameIdentities] = field(default_factory=list)
     rows: list[Difference] = field(default_factory=list)
-    last_tracks: dict[int, int] = field(default_factory=dict)
-    pictures: dict[int, DifferenceImage] = field(default_factory=dict)
-    only_run: int = 0
 
     def add(
         self,

@@ -38,7 +38,7 @@ class Caption(NamedTuple):
 class DifferenceImage(NamedTuple):
     """A picture of a frame: a PNG image as a data URI, with captions.
 
-    ``rows`` are the differences that it shows; ``severity`` grows with their number.
+    ``rows`` are the differences that it shows.
     """
 
     topic: str
@@ -47,7 +47,6 @@ class DifferenceImage(NamedTuple):
     width: int
     height: int
     captions: tuple[Caption, ...]
-    severity: float
     rows: tuple[Difference, ...]
 
 
@@ -58,7 +57,6 @@ def draw_frame(
     true: Labelling,
     pairs: Mapping[int, int],
     rows: Sequence[Difference],
-    severity: float,
 ) -> DifferenceImage | None:
     """Draw found and true masks over the depth image.
 
@@ -68,7 +66,6 @@ def draw_frame(
     pairs : index of the true object for each matched found object.
     rows : rows of the frame: first those of the found objects, then those of the missed ones, both
         in the order of the objects.
-    severity : `DifferenceImage.severity` of the picture.
 
     Returns
     -------
@@ -87,7 +84,7 @@ def draw_frame(
     differing = tuple(row for row in rows if row.difference)
     captions = _captions(rows, found.items, true.items, pairs, width)
     uri = f"data:image/png;base64,{code}"
-    return DifferenceImage(*key, uri, width, height, captions, severity, differing)
+    return DifferenceImage(*key, uri, width, height, captions, differing)
 
 
 def _states(
