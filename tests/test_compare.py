@@ -36,8 +36,7 @@ from shapecat.evaluation.comparison.figures import Tally, figures_of
 from shapecat.evaluation.comparison.labellings import (
     LabelledItem,
     Labelling,
-    find_frame,
-    index_frames,
+    Reference,
 )
 from shapecat.evaluation.comparison.matching import (
     Difference,
@@ -915,13 +914,28 @@ def test_frames_without_objects_have_no_overlap() -> None:
         assert (figures["overlap"] is not None) == found
 
 
+class NamedFrames(Reference[str]):
+    """A reference whose entries are categories, of one object in each frame."""
+
+    def labelling(self, entry: str) -> Labelling:
+        """Return an object of the category."""
+        return Labelling((LabelledItem(None, entry),))
+
+
 def test_labels_of_frame_match_its_topic_and_stamp() -> None:
     """Labels without a topic, or by frame number, count only if there are no better ones."""
     names = {(None, 5): "any", ("/d", 5): "own", ("/d", START): "stamp", (None, START): "old"}
-    frames = index_frames(Path("x"), (((*place, None), name) for place, name in names.items()))
+    labels = NamedFrames(Path("x"), (((*place, None), name) for place, name in names.items()))
     asked = ((("/d", 5), START), (("/e", 5), START), (("/d", 5), 1), (("/e", 5), 1), (("/e", 6), 1))
 
-    assert [find_frame(frames, *place) for place in asked] == ["stamp", "old", "own", "any", None]
+    found = [labels.at(*place) for place in asked]
+    assert [item and item.items[0].category for item in found] == [
+        "stamp",
+        "old",
+        "own",
+        "any",
+        None,
+    ]
 
 
 def test_unmatched_frames_are_reported_by_side(shapecat: Run, run: Path, truth: Path) -> None:

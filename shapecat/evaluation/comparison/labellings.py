@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -22,9 +22,7 @@ __all__ = [
     "Labelling",
     "Place",
     "Reference",
-    "find_frame",
     "finite_box",
-    "index_frames",
     "numbering_notes",
 ]
 
@@ -98,7 +96,7 @@ class Reference(ABC, Generic[_Frame]):
     Parameters
     ----------
     path : path of the reference, for messages.
-    frames : places and entries of the frames, as for `index_frames`.
+    frames : places and entries of the frames, each a `Place` and what `labelling` takes.
 
     Raises
     ------
@@ -119,7 +117,25 @@ class Reference(ABC, Generic[_Frame]):
         self.path = path
         self.frames = len(entries)
         """Number of frames."""
-        self._index = index_frames(path, entries)
+        self._index = self._indexed(entries)
+
+    def _indexed(self, entries: list[tuple[Place, _Frame]]) -> dict[Place, _Frame]:
+        """Return the entries by place.
+
+        A frame is found by its timestamp alone, unless other frames of its topic have the same one:
+        then its number is needed, too.
+        """
+        index: dict[Place, _Frame] = {}
+        for place, entry in entries:
+            if place in index:
+                topic, stamp, number = place
+                name = stamp if number is None else number
+                msg = f"{self.path}: frame {name} of {topic or 'any topic'} is labelled twice"
+                raise RecordingError(msg)
+            index[place] = entry
+        counts = Counter((topic, stamp) for topic, stamp, _ in index)
+        unique = {place: entry for place, entry in index.items() if counts[place[:2]] == 1}
+        return index | {(topic, stamp, None): entry for (topic, stamp, _), entry in unique.items()}
 
     def at(self, key: Key, stamp_ns: int, *, repeated: bool = False) -> Labelling | None:
         """Return the objects of a frame; None if the reference lacks this frame.
@@ -131,8 +147,13 @@ class Reference(ABC, Generic[_Frame]):
         ------
         RecordingError, OutputError : the labels of the frame are damaged.
         """
-        entry = find_frame(self._index, key, stamp_ns, repeated=repeated)
-        return None if entry is None else self.labelling(entry)
+        number = key[1]
+        numbers = [(stamp_ns, number), (stamp_ns, None), (number, None)]
+        if repeated:
+            numbers.remove((stamp_ns, None))
+        places = ((topic, *pair) for pair in numbers for topic in (key[0], None))
+        found = next((place for place in places if place in self._index), None)
+        return None if found is None else self.labelling(self._index[found])
 
     @abstractmethod
     def labelling(self, entry: _Frame) -> Labelling:
@@ -157,50 +178,3 @@ def numbering_notes(other: Reference[Any], start_s: float | None) -> list[str]:
         "labels with timestamps."
     )
     return [note]
-
-
-def index_frames(path: Path, frames: Iterable[tuple[Place, _Frame]]) -> dict[Place, _Frame]:
-    """Return a dictionary of entries for `find_frame`.
-
-    A frame is found by its timestamp alone, unless other frames of its topic have the same one:
-    then its number is needed, too.
-
-    Parameters
-    ----------
-    path : path of the reference, for the message.
-    frames : pairs of a `Place` and the entry of this frame.
-
-    Raises
-    ------
-    RecordingError : two entries describe the same frame.
-    """
-    index: dict[Place, _Frame] = {}
-    for place, entry in frames:
-        if place in index:
-            topic, stamp, number = place
-            name = stamp if number is None else number
-            msg = f"{path}: frame {name} of {topic or 'any topic'} is labelled twice"
-            raise RecordingError(msg)
-        index[place] = entry
-    counts = Counter((topic, stamp) for topic, stamp, _ in index)
-    unique = {place: entry for place, entry in index.items() if counts[place[:2]] == 1}
-    return index | {(topic, stamp, None): entry for (topic, stamp, _), entry in unique.items()}
-
-
-def find_frame(
-    index: Mapping[Place, _Frame], key: Key, stamp_ns: int, *, repeated: bool = False
-) -> _Frame | None:
-    """Return the entry of a frame; None if there is none.
-
-    Parameters
-    ----------
-    index : from `index_frames`.
-    key : topic and number of the frame.
-    repeated : whether other frames of its topic have the same timestamp.
-    """
-    number = key[1]
-    numbers = [(stamp_ns, number), (stamp_ns, None), (number, None)]
-    if repeated:
-        numbers.remove((stamp_ns, None))
-    places = ((topic, *pair) for pair in numbers for topic in (key[0], None))
-    return next((index[place] for place in places if place in index), None)
