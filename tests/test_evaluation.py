@@ -7,7 +7,6 @@ import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -829,8 +828,7 @@ def test_training_views_of_cross_validation_are_mean_over_folds(
     def chain(_: Any, test: DescribedViews, __: Any) -> np.ndarray:
         return np.full((len(test.labels), 2), 0.5)
 
-    monkeypatch.setattr(baselines, "_learn_shapecat", chain)
-    learners = {"shapecat": chain, "plain": partial(chain)}
+    learners = {"shapecat": (chain, True), "plain": (chain, False)}
     monkeypatch.setattr(baselines, "_learners", lambda: learners)
     rows = baselines.compare_learners(views, None, categories=("cup", "can"), root=Path("data"))
 

@@ -64,9 +64,11 @@ def compare_learners(
         raise RecordingError(msg)
     learners = _learners()
     rows = []
-    for name, learner in observed(learners.items(), "baselines", len(learners), observe):
+    for name, (learner, learns_unknown) in observed(
+        learners.items(), "baselines", len(learners), observe
+    ):
         truth, posteriors = _predict_all(learner, splits, categories)
-        learned = _mean_views(splits, with_unknown=learner is _learn_shapecat)
+        learned = _mean_views(splits, with_unknown=learns_unknown)
         rows.append(_compared(name, learned, truth, posteriors))
     return tuple(rows)
 
@@ -138,16 +140,19 @@ def _compared(name: str, learned: int, truth: I4, posteriors: F8) -> Compared:
     return Compared(name, learned, *(None if np.isnan(value) else value for value in figures))
 
 
-def _learners() -> dict[str, _Learner]:
+def _learners() -> dict[str, tuple[_Learner, bool]]:
+    """Return the learners by name, each with whether it learns unknown shapes, too."""
     from shapecat.evaluation.baseline_classifiers import make_baselines  # noqa: PLC0415  scikit-learn
 
     makers = make_baselines(tuple(BLOCKS.values()))
     descriptors, functions = attrgetter("descriptors"), attrgetter("functions")
-    learners: dict[str, _Learner] = {"shapecat": _learn_shapecat}
-    learners |= {name: _make_learner(make, descriptors) for name, make in makers.items()}
-    learners["forest on D2"] = _make_learner(makers["forest"], _d2)
-    learners["forest on D2, D3, A3 (ESF-like)"] = _make_learner(makers["forest"], functions)
-    return learners
+    baselines = {name: _make_learner(make, descriptors) for name, make in makers.items()}
+    baselines["forest on D2"] = _make_learner(makers["forest"], _d2)
+    baselines["forest on D2, D3, A3 (ESF-like)"] = _make_learner(makers["forest"], functions)
+    return {
+        "shapecat": (_learn_shapecat, True),
+        **{name: (learner, False) for name, learner in baselines.items()},
+    }
 
 
 def _learn_shapecat(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
