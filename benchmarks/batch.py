@@ -18,7 +18,7 @@ import click
 
 from benchmarks.measure import markdown
 from benchmarks.whole import tabletop, write
-from shapecat.batch.manifest import Manifest
+from shapecat.batch.manifest import FileManifest
 from tests.faults.invariants import same_results
 
 FORMATS = ("mcap", "ros1", "ros2")
@@ -76,7 +76,7 @@ def main(*, recordings: int, broken: int, frames: int) -> None:
             spent = [process(made, out, *options) for options in runs]
             wall_s = sum(seconds for _, seconds in spent)
             first = first or wall_s
-            entries = Manifest(out / "manifest.jsonl").entries.values()
+            entries = FileManifest(out / "manifest.jsonl").entries.values()
             states = [entry.state for entry in entries]
             reference = reference or out
             names = [path.name for path in reference.glob("*/")]

@@ -27,7 +27,7 @@ import numpy as np
 from benchmarks.batch import process
 from benchmarks.measure import markdown
 from shapecat.batch.ledger import Ledger
-from shapecat.batch.manifest import Entry, Manifest, RemoteManifest
+from shapecat.batch.manifest import Entry, FileManifest, RemoteManifest
 from shapecat.batch.plans import _Planner, plan_batch
 from shapecat.batch.sources import Source
 from shapecat.batch.storage import Location
@@ -147,7 +147,7 @@ def _task_s(executor: Executor, count: int) -> float:
 def measure(frame_s: float) -> Measured:
     """Measure the costs of the shared resources, with Dask workers."""
     with tempfile.TemporaryDirectory() as folder:
-        manifest = Manifest(Path(folder) / "manifest.jsonl")
+        manifest = FileManifest(Path(folder) / "manifest.jsonl")
         entry = Entry("kitchen_0123", "/data/2024/kitchen_0123.mcap", "running", "0" * 16, "1" * 16)
         begun = time.perf_counter()
         for _ in range(1000):
@@ -250,7 +250,7 @@ def limits(count: int) -> tuple[str, ...]:
     job, out = Job(Path(), Path()), "memory://out"
     spent, before = [time.process_time()], peak_mb()
     manifest = RemoteManifest(out)
-    tasks = _Planner(job, out, set(), manifest).tasks(named)
+    tasks = _Planner(job, out, set(), manifest.entries).tasks(named)
     spent.append(time.process_time())
     ledger = Ledger(manifest)
     ledger.record_planned(tasks)
@@ -267,7 +267,7 @@ def limits(count: int) -> tuple[str, ...]:
     again = RemoteManifest(out)
     spent.append(time.process_time())
     with patch("shapecat.batch.plans.run_of", lambda job: {"origin": origins[job.target]}):
-        tasks = _Planner(job, out, {name for name, _ in named}, again).tasks(named)
+        tasks = _Planner(job, out, {name for name, _ in named}, again.entries).tasks(named)
     assert tasks[0].name == first
     assert all(task.status == "complete" for task in tasks)
     spent.append(time.process_time())

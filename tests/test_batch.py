@@ -19,7 +19,7 @@ from click.testing import Result
 
 from shapecat.batch.finding import find_recordings
 from shapecat.batch.ledger import Outcome
-from shapecat.batch.manifest import Manifest
+from shapecat.batch.manifest import FileManifest
 from shapecat.batch.plans import Batch, plan_batch
 from shapecat.batch.runs import process_here, process_on
 from shapecat.config import Settings
@@ -103,7 +103,7 @@ def assert_same(expected: Path, actual: Path, names: Sequence[str] = NAMES) -> N
 
 
 def states(out: Path) -> dict[str, str]:
-    return {name: e.state for name, e in Manifest(out / "manifest.jsonl").entries.items()}
+    return {name: e.state for name, e in FileManifest(out / "manifest.jsonl").entries.items()}
 
 
 ALL_DONE = {**dict.fromkeys(NAMES, "complete"), "broken": "failed"}
@@ -111,7 +111,7 @@ ALL_DONE = {**dict.fromkeys(NAMES, "complete"), "broken": "failed"}
 
 def test_bad_recording_is_reported_and_others_complete(recordings: Path, one_by_one: Path) -> None:
     assert states(one_by_one) == ALL_DONE
-    entries = Manifest(one_by_one / "manifest.jsonl").entries
+    entries = FileManifest(one_by_one / "manifest.jsonl").entries
     assert entries["broken"].exit_code == 3
     assert str(recordings / "broken.mcap") in entries["broken"].message
     assert entries["log"].frames == FRAMES
@@ -315,7 +315,7 @@ def test_killed_local_worker_is_replaced(
 
     assert killed
     assert_same(one_by_one, tmp_path)
-    entries = Manifest(tmp_path / "manifest.jsonl").entries
+    entries = FileManifest(tmp_path / "manifest.jsonl").entries
     assert {entry.folder: entry.tries for entry in entries.values()} == {
         **dict.fromkeys([*NAMES, "broken"], 1),
         killed[0]: 2,
@@ -368,7 +368,7 @@ def test_workers_of_another_version_are_refused(tmp_path: Path) -> None:
     """Workers of another version would silently ignore options that they do not know."""
     (tmp_path / "a.mcap").write_bytes(b"\x89MCAP")
     with plan_batch(Job(Path(), Path()), [str(tmp_path / "a.mcap")], str(tmp_path)) as batch:
-        (outcome,) = process_on(OtherVersion(), batch.tasks, Watcher())
+        (outcome,) = process_on(OtherVersion(), batch.tasks, Watcher(), manifest=batch.manifest)
 
     assert outcome.code == 1
     assert re.search(r"a worker has shapecat 9\.9, this command \d", outcome.message)
@@ -385,7 +385,7 @@ def test_model_that_was_replaced_meanwhile_is_refused(tmp_path: Path) -> None:
     save_model(model, load_model())
     with plan_batch(Job(Path(), Path(), model=model), [str(tmp_path)], str(tmp_path)) as batch:
         save_model(model, replace(load_model(), temperature=2.0))
-        outcomes = list(process_here(batch.tasks, Watcher()))
+        outcomes = list(process_here(batch.tasks, Watcher(), manifest=batch.manifest))
 
     assert {outcome.code for outcome in outcomes} == {2}
     assert all("mine.npz: is not the model" in outcome.message for outcome in outcomes)
@@ -408,7 +408,7 @@ def test_recording_that_only_waited_has_one_try(recordings: Path, tmp_path: Path
         drain(batch, Forgetful(""), Watcher())
 
     assert states(tmp_path) == ALL_DONE
-    assert Manifest(tmp_path / "manifest.jsonl").entries["bag"].tries == 1
+    assert FileManifest(tmp_path / "manifest.jsonl").entries["bag"].tries == 1
 
 
 def test_full_disk_fails_only_large_recording(shapecat: Run, tmp_path: Path) -> None:
@@ -537,7 +537,7 @@ def test_manifest_survives_damaged_lines(tmp_path: Path, one_by_one: Path) -> No
     """A truncated or foreign line must not hide or absorb its neighbours."""
     path = tmp_path / "manifest.jsonl"
     shutil.copy(one_by_one / "manifest.jsonl", path)
-    before = Manifest(path).entries
+    before = FileManifest(path).entries
     complete = {"folder": "log", "recording": "a.mcap", "state": "complete"}
     with path.open("ab") as file:
         file.write(b'{"folder": 3}\n[]\n\xff\n')
@@ -545,12 +545,12 @@ def test_manifest_survives_damaged_lines(tmp_path: Path, one_by_one: Path) -> No
             file.write(json.dumps({**complete, **wrong}).encode() + b"\n")
         file.write(b'{"folder": "log", "recor')
 
-    manifest = Manifest(path)
+    manifest = FileManifest(path)
     assert manifest.entries == before
     manifest.record([before["log"]])
 
-    assert Manifest(path).entries["log"].state == "complete"
-    assert len(Manifest(path).entries) == len(before)
+    assert FileManifest(path).entries["log"].state == "complete"
+    assert len(FileManifest(path).entries) == len(before)
 
 
 def test_batch_continues_if_manifest_cannot_be_written(

@@ -22,7 +22,14 @@ from shapecat.batch import claims
 from shapecat.batch.finding import find_recordings
 from shapecat.batch.finding_urls import _combined_key
 from shapecat.batch.ledger import Ledger, Outcome
-from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State, open_manifest
+from shapecat.batch.manifest import (
+    Entry,
+    FileManifest,
+    Manifest,
+    RemoteManifest,
+    State,
+    open_manifest,
+)
 from shapecat.batch.naming import existing_names, name_folders
 from shapecat.batch.plans import _input_key, parse_shard, plan_batch, shard_of
 from shapecat.batch.runs import _reporter, process_here, process_on
@@ -616,7 +623,6 @@ def test_batch_checks_results_of_other_model_settings_or_content(
     model = SimpleNamespace(model_id="m1")
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: model)
     with plan_batch(job, [str(source.parent)], str(out)) as batch:
-        assert batch.manifest is not None
         (task,) = (task for task in batch.tasks if task.job.folder.name == "lab")
         batch.manifest.record(
             [Entry("lab", "lab.mcap", "complete", input=task.input, work=task.work)]
@@ -696,7 +702,6 @@ def test_batch_checks_run_without_its_outputs(
     model = SimpleNamespace(model_id="m1")
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: model)
     with plan_batch(job, [str(source.parent)], str(out)) as batch:
-        assert batch.manifest is not None
         (task,) = (task for task in batch.tasks if task.name == "lab")
         batch.manifest.record(
             [Entry("lab", "lab.mcap", "complete", input=task.input, work=task.work)]
@@ -733,7 +738,6 @@ def test_batch_notices_run_that_was_replaced_alone(
     write_run(out / "lab", run)
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
     with plan_batch(job, [str(source.parent)], str(out)) as batch:
-        assert batch.manifest is not None
         (task,) = (task for task in batch.tasks if task.name == "lab")
         batch.manifest.record([replace(task.entry(), state="complete")])
 
@@ -759,7 +763,6 @@ def test_batch_notices_run_at_url_that_was_replaced(
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
     (Location(out) / "lab" / "frames.parquet").write(b"table")
     with plan_batch(job, [str(source.parent)], out) as batch:
-        assert batch.manifest is not None
         (task,) = (task for task in batch.tasks if task.name == "lab")
         batch.manifest.record([replace(task.entry(), state="complete")])
     if there is not None:
@@ -842,7 +845,7 @@ def test_times_of_manifest_are_in_utc(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setenv("TZ", "Asia/Kathmandu")
     time.tzset()
     try:
-        manifest = Manifest(tmp_path / "manifest.jsonl")
+        manifest = FileManifest(tmp_path / "manifest.jsonl")
         manifest.record([Entry("a", "a.mcap", "complete")])
     finally:
         monkeypatch.undo()
@@ -854,7 +857,7 @@ def test_times_of_manifest_are_in_utc(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_full_disk_leaves_no_partial_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The next line would be appended to the part of a line that fit on the disk."""
     path = tmp_path / "manifest.jsonl"
-    Manifest(path).record([Entry("a", "a.mcap", "complete")])
+    FileManifest(path).record([Entry("a", "a.mcap", "complete")])
     whole = path.read_bytes()
     write = os.write
 
@@ -866,21 +869,21 @@ def test_full_disk_leaves_no_partial_line(tmp_path: Path, monkeypatch: pytest.Mo
     with monkeypatch.context() as patch:
         patch.setattr("shapecat.batch.manifest.os.write", fill)
         with pytest.raises(OutputError, match="No space left"):
-            Manifest(path).record([Entry("b", "b" * 200, "failed")])
+            FileManifest(path).record([Entry("b", "b" * 200, "failed")])
     assert path.read_bytes() == whole
 
-    Manifest(path).record([Entry("c", "c.mcap", "planned")])
+    FileManifest(path).record([Entry("c", "c.mcap", "planned")])
     assert [json.loads(line)["folder"] for line in path.read_text().splitlines()] == ["a", "c"]
 
 
 def test_partial_line_of_crash_does_not_lose_next_entry(tmp_path: Path) -> None:
     path = tmp_path / "manifest.jsonl"
     path.write_bytes(b'{"folder": "a", "recording": "a.mcap", "state": "comp')
-    Manifest(path).record([Entry("b", "b.mcap", "failed", tries=2, exit_code=3, message="bad")])
+    FileManifest(path).record([Entry("b", "b.mcap", "failed", tries=2, exit_code=3, message="bad")])
 
-    entry = Manifest(path).entries["b"]
+    entry = FileManifest(path).entries["b"]
     assert (entry.state, entry.tries, entry.exit_code, entry.message) == ("failed", 2, 3, "bad")
-    assert list(Manifest(path).entries) == ["b"]
+    assert list(FileManifest(path).entries) == ["b"]
 
 
 OURS = b'{"folder": "a", "recording": "a.mcap", "state": "comp'
@@ -926,16 +929,16 @@ def test_manifest_of_another_program_is_refused(
 def test_last_line_of_a_recording_counts(tmp_path: Path) -> None:
     path = tmp_path / "manifest.jsonl"
     for state in get_args(State):
-        Manifest(path).record([Entry("a", "a.mcap", state)])
+        FileManifest(path).record([Entry("a", "a.mcap", state)])
 
-    assert Manifest(path).entries["a"].state == get_args(State)[-1]
+    assert FileManifest(path).entries["a"].state == get_args(State)[-1]
 
 
 def test_entry_with_zero_tracks_is_not_read_as_unknown(tmp_path: Path) -> None:
     """If zero tracks were read as unknown, the run would be opened again to count them."""
     path = tmp_path / "manifest.jsonl"
-    Manifest(path).record([Entry("a", "a.mcap", "complete", seconds=0.0, frames=3, tracks={})])
-    read = Manifest(path).entries["a"]
+    FileManifest(path).record([Entry("a", "a.mcap", "complete", seconds=0.0, frames=3, tracks={})])
+    read = FileManifest(path).entries["a"]
 
     assert (read.seconds, read.frames, read.tracks) == (0, 3, {})
 
@@ -1010,7 +1013,6 @@ def test_entries_of_other_work_are_replaced(source: Path, monkeypatch: pytest.Mo
     with plan_batch(Job(Path(), Path()), [str(source.parent)], out) as batch:
         (task,) = (task for task in batch.tasks if task.name == "lab")
         manifest = batch.manifest
-        assert manifest is not None
         ledger = Ledger(manifest)
         manifest.record([Entry("lab", "lab.mcap", "planned", task.input, "old work")])
         ledger.record_planned([task])
@@ -1028,10 +1030,10 @@ def test_earlier_outcome_is_known_without_a_manifest(tmp_path: Path) -> None:
     """On a full disk, the manifest is given up, but complete runs must count as complete."""
     job = Job(Path("lab.mcap"), tmp_path / "lab")
     task: Any = SimpleNamespace(name="lab", job=job)
-    missing = Ledger(None).earlier_outcome(task)
+    missing = Ledger(Manifest()).earlier_outcome(task)
     job.folder.mkdir()
     write_run(job.folder, run_info(counts={"frames": 3, "tracks": {"cup": 2}}, seconds={}))
-    found = Ledger(None).earlier_outcome(task)
+    found = Ledger(Manifest()).earlier_outcome(task)
 
     assert (missing.code, "no run.json there" in missing.message) == (1, True)
     assert found.summary is not None
@@ -1144,7 +1146,6 @@ def test_content_of_same_size_is_not_trusted(
     key = content_key({"size": 7, "name": "lab.mcap"})
     monkeypatch.setattr("shapecat.batch.plans._input_key", lambda _path: (key, 7))
     with plan_batch(job, [str(source.parent)], str(out)) as batch:
-        assert batch.manifest is not None
         batch.manifest.record([replace(task.entry(), state="complete") for task in batch.tasks])
 
     assert status_of(job, source, out) == "check"
@@ -1189,7 +1190,7 @@ def test_lost_recording_counts_as_tried_if_it_had_started(
             assert not ledger.record_lost(task, error)
         ledger.record_outcome(task, Outcome(task.job, message="gave up", code=1))
     path = Path(out) / "manifest.jsonl"
-    entry = Manifest(path).entries["lab"]
+    entry = FileManifest(path).entries["lab"]
 
     assert (entry.state, entry.tries, entry.message) == ("failed", tries, "gave up")
     assert path.read_text().count('"running"') == 1 + begun
@@ -1236,7 +1237,7 @@ def test_largest_recordings_start_first(tmp_path: Path, monkeypatch: pytest.Monk
         (tmp_path / f"{name}.mcap").write_bytes(bytes(size))
     executor = NameCollector()
     with plan_batch(Job(Path(), Path()), [str(tmp_path)], str(tmp_path / "out")) as batch:
-        list(process_on(executor, batch.tasks, ignore))
+        list(process_on(executor, batch.tasks, ignore, manifest=batch.manifest))
 
     assert executor.names == ["b", "c", "a"]
 
@@ -1257,7 +1258,7 @@ def test_recording_is_complete_in_manifest_before_outcome_is_returned(
     out = tmp_path / "out"
     with plan_batch(Job(Path(), Path()), [str(tmp_path)], str(out)) as batch:
         first = next(process_here(batch.tasks, ignore, manifest=batch.manifest))
-        lines = Manifest(out / "manifest.jsonl").entries
+        lines = FileManifest(out / "manifest.jsonl").entries
 
     entry = lines.pop(first.job.folder.name)
     assert (entry.state, entry.seconds, entry.frames) == ("complete", 1.5, 3)

@@ -34,12 +34,12 @@ class Outcome:
 
 
 class Ledger:
-    """Counts the attempts at each recording, and writes the manifest, if there is one.
+    """Counts the attempts at each recording, and writes the manifest.
 
     A failed write ends the writing, but not the batch.
     """
 
-    def __init__(self, manifest: Manifest | None) -> None:
+    def __init__(self, manifest: Manifest) -> None:
         self._manifest = manifest
         self._lock = Lock()
         self._in_progress: dict[str, Entry] = {}
@@ -51,18 +51,15 @@ class Ledger:
         while some := list(islice(new, _MOST_LINES)):
             self._write(some)
 
-    def _last_entry(self, folder: str) -> Entry | None:
-        return None if self._manifest is None else self._manifest.entries.get(folder)
-
     def _is_recorded(self, entry: Entry, state: State) -> bool:
         """Return whether the folder's last entry has this state and the command of ``entry``."""
-        last = self._last_entry(entry.folder)
+        last = self._manifest.entries.get(entry.folder)
         return last is not None and last.state == state and last.same_command(entry)
 
     def earlier_outcome(self, task: Task) -> Outcome:
         """Return the outcome of a task that an earlier command completed."""
         job = task.job
-        entry = self._last_entry(task.name)
+        entry = self._manifest.entries.get(task.name)
         if entry is not None and entry.tracks is not None and entry.frames is not None:
             counts = {"frames": entry.frames, "tracks": entry.tracks}
             return Outcome(job, Summary(counts, entry.seconds or 0.0, (), processed=False))
@@ -117,10 +114,8 @@ class Ledger:
         self._write([new])
 
     def _write(self, entries: Sequence[Entry]) -> None:
-        if self._manifest is None:
-            return
         try:
             self._manifest.record(entries)
         except OutputError as error:
             _log.error("%s", error)
-            self._manifest = None
+            self._manifest = Manifest()

@@ -26,6 +26,7 @@ from shapecat.errors import OutputError, ShapecatError, explained
 __all__ = [
     "MANIFEST",
     "Entry",
+    "FileManifest",
     "Manifest",
     "RemoteManifest",
     "State",
@@ -94,14 +95,11 @@ _TYPES: dict[str, type | UnionType] = {
 
 
 class Manifest:
-    """The manifest file, with the last entry of each run folder."""
+    """The last entry of each run folder, in memory; subclasses write the entries, too."""
 
-    def __init__(self, path: Path) -> None:
-        """Read the file, if it exists and is readable."""
-        self.path, self.name = path, str(path)
+    def __init__(self) -> None:
+        """Begin without entries."""
         self.entries: dict[str, Entry] = {}
-        with suppress(OSError), path.open("rb") as file:  # reported when it is written to
-            self._merge(file)
 
     def __enter__(self) -> Self:
         return self
@@ -109,28 +107,38 @@ class Manifest:
     def __exit__(self, *error: object) -> None:
         """Do nothing: each line is written at once."""
 
-    def begin(self) -> bytes:
-        """Return the first megabyte of the file; empty if there is no readable file."""
-        with suppress(OSError), self.path.open("rb") as file:
-            return file.read(_PART_BYTES)
-        return b""
-
-    def _merge(self, lines: Iterable[bytes]) -> None:
-        for entry in filter(None, map(_parse, lines)):
-            self.entries[entry.folder] = entry
-
     def record(self, entries: Iterable[Entry]) -> None:
-        """Append entries, stamped with the current time.
+        """Add entries, stamped with the current time.
 
         Raises
         ------
-        OutputError : the file cannot be written.
+        OutputError : they cannot be written.
         """
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
         stamped = [replace(entry, time=now) for entry in entries]
         self.entries.update((entry.folder, entry) for entry in stamped)
         if stamped:
             self._append(b"".join(map(_line, stamped)))
+
+    def _append(self, lines: bytes) -> None:
+        """Write lines, in subclasses."""
+
+
+class FileManifest(Manifest):
+    """A manifest in a file, to which each line is appended at once."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the file, if it exists and is readable."""
+        super().__init__()
+        self.path, self.name = path, str(path)
+        with suppress(OSError), path.open("rb") as file:  # reported when it is written to
+            self.entries.update((entry.folder, entry) for entry in _entries(file))
+
+    def begin(self) -> bytes:
+        """Return the first megabyte of the file; empty if there is no readable file."""
+        with suppress(OSError), self.path.open("rb") as file:
+            return file.read(_PART_BYTES)
+        return b""
 
     def _append(self, lines: bytes) -> None:
         failing = explained(f"{self.path}: cannot be written", OutputError)
@@ -159,7 +167,7 @@ class RemoteManifest(Manifest):
         ------
         OutputError : the storage cannot be read.
         """
-        self.entries = {}
+        super().__init__()
         place = Location(url, OutputError)
         self._summary = place / (f"manifest-{shard}.jsonl" if shard else MANIFEST)
         self.name = self._summary.url
@@ -194,15 +202,15 @@ class RemoteManifest(Manifest):
             name, key = url.rpartition("/")[2], content_key(info)
             if not name.startswith(self._writer) and self._part_keys.get(name) != key:
                 self._part_keys[name] = key
-                self._merge(((self._parts / name).read() or b"").splitlines())
+                self._keep_latest(((self._parts / name).read() or b"").splitlines())
 
     def begin(self) -> bytes:
         """Return the content of the existing summary; empty if there is none."""
         return self._summary.read() or b""
 
-    def _merge(self, lines: Iterable[bytes]) -> None:
+    def _keep_latest(self, lines: Iterable[bytes]) -> None:
         """Keep the later of two entries, since several writers may work at the same time."""
-        for entry in filter(None, map(_parse, lines)):
+        for entry in _entries(lines):
             last = self.entries.get(entry.folder)
             if last is None or last.time <= entry.time:
                 self.entries[entry.folder] = entry
@@ -240,7 +248,7 @@ class RemoteManifest(Manifest):
                 self.send()
 
 
-def open_manifest(out: str, *, shard: str | None = None) -> Manifest:
+def open_manifest(out: str, *, shard: str | None = None) -> FileManifest | RemoteManifest:
     """Open the manifest in a folder or at a URL.
 
     Parameters
@@ -252,7 +260,7 @@ def open_manifest(out: str, *, shard: str | None = None) -> Manifest:
     OutputError : shapecat did not make the existing file, or the URL cannot be read.
     """
     part = shard.replace("/", "-of-") if shard else ""
-    manifest = RemoteManifest(out, part) if is_url(out) else Manifest(Path(out) / MANIFEST)
+    manifest = RemoteManifest(out, part) if is_url(out) else FileManifest(Path(out) / MANIFEST)
     lines = () if manifest.entries else manifest.begin().splitlines()
     begins = [line.strip(b"\0 ")[: len(_BEGIN)] for line in lines]  # a power cut may leave zeros
     if any(begins) and not any(map(_BEGIN.startswith, filter(None, begins))):
@@ -278,6 +286,11 @@ def _line(entry: Entry) -> bytes:
     values = ((name, getattr(entry, name)) for name in _NAMES)
     present = {name: value for name, value in values if value is not None and value != ""}
     return json.dumps(present, ensure_ascii=False).encode("utf-8", "surrogatepass") + b"\n"
+
+
+def _entries(lines: Iterable[bytes]) -> Iterator[Entry]:
+    """Yield the entries of the lines that are complete."""
+    return filter(None, map(_parse, lines))
 
 
 def _parse(line: bytes) -> Entry | None:

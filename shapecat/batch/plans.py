@@ -3,9 +3,9 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -131,11 +131,11 @@ def shard_of(named: Sequence[_NamedSource], index: int, count: int) -> list[_Nam
 class Batch:
     """The tasks of a batch, the manifest, and the number of files that are not recordings.
 
-    ``manifest`` is None for a single recording; ``notes`` are as in `SearchResult`.
+    The manifest of a single recording is not written. ``notes`` are as in `SearchResult`.
     """
 
     tasks: list[Task]
-    manifest: Manifest | None
+    manifest: Manifest
     skipped: int
     notes: Sequence[str] = ()
 
@@ -167,31 +167,33 @@ def plan_batch(
     found = find_recordings(sources)
     listing = Location(out, OutputError).names() if is_url(out) else _names_in(Path(out))
     stems, parents = [s.stem for s in found.sources], [s.parent for s in found.sources]
-    with open_manifest(out, shard=shard) if len(stems) > 1 else nullcontext() as manifest:
-        noted = manifest.entries if manifest is not None else {}
-        names = name_folders(stems, parents, existing_names(found.sources, out, listing, noted))
-        named = list(zip(names, found.sources, strict=True))
-        planner = _Planner(job, out, listing, manifest)
+    several = len(stems) > 1
+    with open_manifest(out, shard=shard) if several else Manifest() as manifest:
+        known = existing_names(found.sources, out, listing, manifest.entries)
+        named = list(zip(name_folders(stems, parents, known), found.sources, strict=True))
+        if several or job.model is not None or is_url(out):
+            job = dataclasses.replace(job, model_id=load_model(job.model).model_id)
+        planner = _Planner(job, out, listing, manifest.entries)
         chosen = shard_of(named, *part) if part is not None else named
         yield Batch(planner.tasks(chosen), manifest, found.skipped, found.notes)
 
 
 class _Planner:
-    """Determines the status of each recording, given the names in the folder of results."""
+    """Determines the status of each recording.
 
-    def __init__(self, job: Job, out: str, listing: set[str], manifest: Manifest | None) -> None:
-        self._out, self._listing, self._manifest = out, listing, manifest
-        has_model_id = manifest is not None or job.model is not None or is_url(out)
-        self._model_id = load_model(job.model).model_id if has_model_id else ""
-        self._job = dataclasses.replace(job, model_id=self._model_id)
-        self._work = _hash([job.settings.as_dict(), job.selection(), self._model_id])
+    ``listing`` are the names in the folder of results, ``entries`` those of the manifest.
+    """
+
+    def __init__(self, job: Job, out: str, listing: set[str], entries: Mapping[str, Entry]) -> None:
+        self._job, self._out, self._listing, self._entries = job, out, listing, entries
+        self._work = _hash([job.settings.as_dict(), job.selection(), job.model_id])
         self._command = ""
 
     def tasks(self, named: Sequence[_NamedSource]) -> list[Task]:
         """Return the task of each recording."""
         if self._job.overwrite:
             self._command = _command(
-                self._job, self._work, (self._entry(name) for name, _ in named)
+                self._job, self._work, (self._entries.get(name) for name, _ in named)
             )
         chunks = [named[first : first + _CHUNK] for first in range(0, len(named), _CHUNK)]
         with ThreadPoolExecutor(_THREADS) as pool:
@@ -216,15 +218,12 @@ class _Planner:
         )
         return dataclasses.replace(task, status=self._status(task))
 
-    def _entry(self, name: str) -> Entry | None:
-        return self._manifest.entries.get(name) if self._manifest is not None else None
-
     def _status(self, task: Task) -> Status:
-        entry, overwrite = self._entry(task.name), self._job.overwrite
+        entry, overwrite = self._entries.get(task.name), self._job.overwrite
         exists = task.name in self._listing
         if exists and task.input and entry is not None and entry.state == "complete":
             same = entry.same_command if overwrite else entry.same_work
-            if same(task.entry()) and _is_wanted_run(task, self._model_id):
+            if same(task.entry()) and _is_wanted_run(task):
                 return "complete"
         in_progress = {partial_path(Path(task.name)).name, claim_name(task.name)}
         if (overwrite or not exists) and not self._listing.isdisjoint(in_progress):
@@ -258,7 +257,7 @@ def _names_in(folder: Path) -> set[str]:
     return set()
 
 
-def _is_wanted_run(task: Task, model_id: str) -> bool:
+def _is_wanted_run(task: Task) -> bool:
     """Return whether a run listed as complete is the requested one, and has its outputs.
 
     A command for this recording alone, or with other shards, may have replaced the run, and an
@@ -275,7 +274,7 @@ def _is_wanted_run(task: Task, model_id: str) -> bool:
     wanted: dict[str, Any] = {
         "settings": job.settings.as_dict(),
         "options": job.selection(),
-        "model": {"id": model_id},
+        "model": {"id": job.model_id},
     }
     differing = differences(run, wanted).keys() - {"topics", *OUTPUT_OPTIONS}
     chosen, requested = (

@@ -40,15 +40,15 @@ if unknown), possibly from several threads."""
 
 
 def process_here(
-    tasks: Sequence[Task], report: _Report, *, cores: int = 1, manifest: Manifest | None = None
+    tasks: Sequence[Task], report: _Report, *, manifest: Manifest, cores: int = 1
 ) -> Iterator[Outcome]:
     """Process the tasks one by one in this process; yield their outcomes.
 
     Parameters
     ----------
     report : receives the progress.
-    cores : number of processes that perceive the frames of a recording.
     manifest : receives the state of each recording.
+    cores : number of processes that perceive the frames of a recording.
 
     Raises
     ------
@@ -74,8 +74,8 @@ def process_on(
     tasks: Sequence[Task],
     report: _Report,
     *,
+    manifest: Manifest,
     cores: int = 1,
-    manifest: Manifest | None = None,
 ) -> Iterator[Outcome]:
     """Process the tasks on an executor, largest first; yield their outcomes.
 
