@@ -262,7 +262,7 @@ def limits(count: int) -> tuple[str, ...]:
         )
     manifest.send()
     spent.append(time.process_time())
-    origins = {task.job.target: {"input": task.input, "work": task.work} for task in tasks}
+    origins = {task.job.target: {"input": task.source.key, "work": task.work} for task in tasks}
     del manifest, tasks, ledger
     again = RemoteManifest(out)
     spent.append(time.process_time())

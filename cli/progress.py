@@ -65,7 +65,7 @@ def describe_plan(
 
 
 def _remaining_bytes(tasks: Sequence["Task"]) -> int:
-    return sum(task.bytes for task in tasks if task.status != "complete")
+    return sum(task.source.bytes for task in tasks if task.status != "complete")
 
 
 class Progress:
@@ -130,7 +130,7 @@ class Progress:
                 self.complete += 1
             task = self.tasks.get(name)
             if task is not None and (outcome.summary is None or outcome.summary.processed):
-                self.done_bytes += task.bytes
+                self.done_bytes += task.source.bytes
             self.show_ended(outcome)
 
     def remaining_s(self) -> float | None:
@@ -145,7 +145,9 @@ class Progress:
         )
 
     def _bytes_done(self) -> float:
-        running = (self.tasks[name].bytes * _share(*state) for name, state in self.running.items())
+        running = (
+            self.tasks[name].source.bytes * _share(*state) for name, state in self.running.items()
+        )
         return float(self.done_bytes + sum(running))
 
     def note(self, text: str) -> None:
@@ -230,7 +232,7 @@ class JsonProgress(Progress):
         before, now = self._last.get(folder, ("", 0.0)), time.monotonic()
         if phase != before[0] or now - before[1] >= _EVENT_S or done == total:
             self._last[folder] = (phase, now)
-            recording = self.tasks[folder].recording
+            recording = self.tasks[folder].source.recording
             _event("progress", recording=recording, phase=phase, done=done, total=total)
 
     def show_ended(self, outcome: "Outcome") -> None:

@@ -625,7 +625,7 @@ def test_batch_checks_results_of_other_model_settings_or_content(
     with plan_batch(job, [str(source.parent)], str(out)) as batch:
         (task,) = (task for task in batch.tasks if task.job.folder.name == "lab")
         batch.manifest.record(
-            [Entry("lab", "lab.mcap", "complete", input=task.input, work=task.work)]
+            [Entry("lab", "lab.mcap", "complete", input=task.source.key, work=task.work)]
         )
 
     assert status_of(job, source, out) == "complete"
@@ -650,7 +650,7 @@ def test_batch_notices_replaced_recording_with_same_times(source: Path, tmp_path
 
     def key() -> str:
         with plan_batch(Job(Path(), Path()), [str(source.parent)], str(tmp_path / "out")) as batch:
-            return next(task.input for task in batch.tasks if task.path == str(source))
+            return next(task.source.key for task in batch.tasks if task.source.path == str(source))
 
     before, stat = key(), source.stat()
     assert key() == before
@@ -704,7 +704,7 @@ def test_batch_checks_run_without_its_outputs(
     with plan_batch(job, [str(source.parent)], str(out)) as batch:
         (task,) = (task for task in batch.tasks if task.name == "lab")
         batch.manifest.record(
-            [Entry("lab", "lab.mcap", "complete", input=task.input, work=task.work)]
+            [Entry("lab", "lab.mcap", "complete", input=task.source.key, work=task.work)]
         )
 
     assert status_of(job, source, out) == status
@@ -766,7 +766,7 @@ def test_batch_notices_run_at_url_that_was_replaced(
         (task,) = (task for task in batch.tasks if task.name == "lab")
         batch.manifest.record([replace(task.entry(), state="complete")])
     if there is not None:
-        run = there({"input": task.input, "work": task.work})
+        run = there({"input": task.source.key, "work": task.work})
         (Location(out) / "lab" / "run.json").write(json.dumps(run).encode())
 
     with plan_batch(job, [str(source.parent)], out) as batch:
@@ -1014,7 +1014,7 @@ def test_entries_of_other_work_are_replaced(source: Path, monkeypatch: pytest.Mo
         (task,) = (task for task in batch.tasks if task.name == "lab")
         manifest = batch.manifest
         ledger = Ledger(manifest)
-        manifest.record([Entry("lab", "lab.mcap", "planned", task.input, "old work")])
+        manifest.record([Entry("lab", "lab.mcap", "planned", task.source.key, "old work")])
         ledger.record_planned([task])
         assert manifest.entries["lab"].work == task.work
         manifest.record([Entry("lab", "lab.mcap", "complete", "old input", task.work)])
@@ -1022,7 +1022,7 @@ def test_entries_of_other_work_are_replaced(source: Path, monkeypatch: pytest.Mo
         counts = {"frames": 3, "tracks": {"cup": 2}}
         ledger.record_outcome(task, Outcome(task.job, Summary(counts, 1.5, ())))
 
-    assert manifest.entries["lab"].input == task.input
+    assert manifest.entries["lab"].input == task.source.key
     assert manifest.entries["lab"].state == "complete"
 
 
@@ -1392,7 +1392,7 @@ def test_run_at_url_keeps_folder_when_recording_of_same_name_is_added(
     names = []
     for shard in ("0/2", "1/2"):
         with plan_batch(Job(Path(), Path()), days, out, shard=shard) as batch:
-            names += [(task.name, task.path) for task in batch.tasks]
+            names += [(task.name, task.source.path) for task in batch.tasks]
     assert dict(names) == {"lab": path, "tuesday_lab": days[0]}
 
 

@@ -36,7 +36,7 @@ RENDER: Any = import_module("shapecat.cli.render")
 
 
 def task(name: str, status: str = "new", size: int = 0) -> Any:
-    return SimpleNamespace(name=name, status=status, bytes=size)
+    return SimpleNamespace(name=name, status=status, source=SimpleNamespace(bytes=size))
 
 
 def ended(name: str, *, processed: bool | None, warnings: tuple[str, ...] = ()) -> Any:
@@ -337,7 +337,7 @@ def test_json_events_keep_zeros_and_omit_unknown_values(
     monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
     tasks = [task("a", size=700), task("b", "retry", 40), task("c", "complete", 3), task("d")]
     for item in tasks:
-        item.recording = f"in/{item.name}.bag"
+        item.source.recording = f"in/{item.name}.bag"
     progress = PROGRESS.JsonProgress(tasks)
     progress.progress("a", "perceive", 0, None)
     now = 100.3

@@ -47,31 +47,21 @@ class Task:
     ----------
     template : a job with the options that all tasks share.
     out : folder or URL of the batch; ``name`` is the run folder in it.
-    path, url : the recording; one of them is empty.
+    source : the recording, with its key and size unless they are unknown.
     status : ``complete`` according to manifest and run.json; ``resume`` if a run was interrupted;
         ``check`` if there is a run folder that may hold other results; ``retry`` if the last
         attempt failed; else ``new``.
-    bytes : size of the recording, 0 if unknown.
-    input, work : keys; ``input`` changes with the content of the recording, ``work`` with the
-        options, settings and model.
+    work : a key that changes with the options, settings and model.
     command : identifies a command that overwrites; empty for others.
     """
 
     template: Job
     out: str
     name: str
-    path: str
-    url: str
+    source: Source
     status: Status
-    bytes: int
-    input: str
     work: str
     command: str = ""
-
-    @property
-    def recording(self) -> str:
-        """The path or URL of the recording."""
-        return self.url or self.path
 
     @property
     def job(self) -> Job:
@@ -79,11 +69,11 @@ class Task:
         at_url = is_url(self.out)
         return dataclasses.replace(
             self.template,
-            source=Path(self.path),
+            source=Path(self.source.path),
             folder=Path(self.name) if at_url else Path(self.out, self.name),
-            origin=self.url,
+            origin=self.source.url,
             target=f"{self.out.rstrip('/')}/{self.name}" if at_url else "",
-            input_key=self.input,
+            input_key=self.source.key,
             work_key=self.work,
         )
 
@@ -91,9 +81,9 @@ class Task:
         """Return the first manifest entry of the task."""
         return Entry(
             folder=self.name,
-            recording=self.recording,
+            recording=self.source.recording,
             state="planned",
-            input=self.input,
+            input=self.source.key,
             work=self.work,
             command=self.command,
         )
@@ -201,18 +191,15 @@ class _Planner:
             return list(chain.from_iterable(tasks))
 
     def _task(self, name: str, source: Source) -> Task:
-        key, size = source.key, source.bytes
-        if not key:
+        if not source.key:
             key, size = stat_url(source.url) if source.url else _input_key(Path(source.path))
+            source = dataclasses.replace(source, key=key, bytes=size)
         task = Task(
             template=self._job,
             out=self._out,
             name=name,
-            path=source.path,
-            url=source.url,
+            source=source,
             status="new",
-            bytes=size,
-            input=key,
             work=self._work,
             command=self._command,
         )
@@ -221,7 +208,7 @@ class _Planner:
     def _status(self, task: Task) -> Status:
         entry, overwrite = self._entries.get(task.name), self._job.overwrite
         exists = task.name in self._listing
-        if exists and task.input and entry is not None and entry.state == "complete":
+        if exists and task.source.key and entry is not None and entry.state == "complete":
             same = entry.same_command if overwrite else entry.same_work
             if same(task.entry()) and _is_wanted_run(task):
                 return "complete"

@@ -113,7 +113,7 @@ def _outcomes(
 
     yield from (ledger.earlier_outcome(task) for task in tasks if task.status == "complete")
     waiting = [task for task in tasks if task.status != "complete"]
-    waiting.sort(key=lambda task: task.bytes)
+    waiting.sort(key=lambda task: task.source.bytes)
     running = 0
     while waiting or running:
         while waiting and running < _MOST_SUBMITTED:

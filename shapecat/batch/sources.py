@@ -32,8 +32,8 @@ class Source:
     """A recording at a path or a URL; the field that does not apply is empty.
 
     ``stem`` is its name without suffix and ``parent`` the name of its folder; both serve to name
-    the run folder. ``key`` changes with the content at a URL, and ``bytes`` is its size; they are
-    empty and 0 for a path, and if they are unknown.
+    the run folder. ``key`` changes with the content, and ``bytes`` is the size; they are empty and
+    0 if they are unknown, and for a path until it is planned.
     """
 
     path: str
@@ -42,6 +42,11 @@ class Source:
     parent: str
     key: str = ""
     bytes: int = 0
+
+    @property
+    def recording(self) -> str:
+        """The path or URL of the recording."""
+        return self.url or self.path
 
 
 def has_recording_suffix(name: str) -> bool:
