@@ -22,7 +22,12 @@ from shapecat.runs.labelled_tracks import _last_in
 from shapecat.runs.labels import meaning
 from shapecat.runs.labels.corrections import _valid_labels, adopt_labels, read_labels, relabel
 from shapecat.runs.labels.meaning import TrackLabel
-from shapecat.runs.labels.track_table import TrackRow, read_track_table, write_track_table
+from shapecat.runs.labels.track_table import (
+    TrackRow,
+    TrackTable,
+    read_track_table,
+    write_track_table,
+)
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.tracks import _CSV, _write_csv
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
@@ -716,11 +721,12 @@ def test_merged_parts_of_one_frame_become_one_object(tmp_path: Path) -> None:
 def test_new_categories_come_last(tmp_path: Path) -> None:
     """A new name before the others would renumber the classes of a data set."""
     run = run_info(model={"categories": ["cup", "can"]})
+    table = TrackTable((), (), ())
     names = ("vase", "can", "unknown", "pan", "amphora", "jar", "cup", "urn")
     labels = {k: TrackLabel(k, name, 1.0) for k, name in enumerate(names, 1)}
 
-    alone = FinishedRun(tmp_path, run, labels)
-    beside = FinishedRun(tmp_path, run, labels, common=("can", "jug"))
+    alone = FinishedRun(tmp_path, run, table, labels)
+    beside = FinishedRun(tmp_path, run, table, labels, common=("can", "jug"))
 
     assert alone.categories == ("cup", "can", "amphora", "jar", "pan", "urn", "vase")
     assert beside.categories == ("can", "jug", "cup", "amphora", "jar", "pan", "urn", "vase")

@@ -75,6 +75,7 @@ from shapecat.recordings.messages import Topic
 from shapecat.runs.labelled_frames import _join, read_labelled_frames
 from shapecat.runs.labelled_tracks import LabelledTracks
 from shapecat.runs.labels.meaning import TrackLabel, _slips
+from shapecat.runs.labels.track_table import TrackTable
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.tables.masks import read_nearest_masks
 from shapecat.runs.tables.reading import Key
@@ -572,7 +573,6 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
     sensors = ("/other", "/depth")
     labelled = [labelled_frame(k, topic=topic) for k in range(len(images)) for topic in sensors]
     stubs: dict[str, Any] = {
-        "read_track_table": lambda _path: SimpleNamespace(labels={}),
         "_chosen": lambda *_: {("/depth", k) for k in range(len(images))},
         "open_source": lambda *_: nullcontext(),
         "with_colour": lambda frames, *_: ((one, None, None) for one in frames),
@@ -582,7 +582,7 @@ def test_images_without_certain_objects_are_omitted(monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(f"{place}.{name}", stub)
     run: Any = {"options": {"topics": ["/depth"]}, "color": {"/depth": "/color"}}
     finished: Any = SimpleNamespace(
-        folder=Path(), info=run, name="lab", frames=lambda: iter(labelled)
+        info=run, name="lab", table=TrackTable((), (), ()), frames=lambda: iter(labelled)
     )
 
     left_out = Counter[str]()
@@ -1151,18 +1151,21 @@ def test_tree_and_pictures_of_a_frame_are_of_its_own_sensor(
             tables.write([perception(3, count, topic)], [FrameRow(5, None)])
     write_tracks(tmp_path, [(5, 3, 0), (6, 3, 1), (7, 3, 0)], topics=["/a", "/a", "/b"])
     labels = {track: TrackLabel(track, "cup", 0.9) for track in (5, 6, 7)}
+    rows = [SimpleNamespace(track=k, category="cup", confidence=0.9) for k in labels]
     finished: Any = SimpleNamespace(
-        folder=tmp_path, labels=labels, frames=lambda: read_labelled_frames(tmp_path, labels)
+        folder=tmp_path,
+        table=SimpleNamespace(rows=rows),
+        labels=labels,
+        frames=lambda: read_labelled_frames(tmp_path, labels),
     )
     monkeypatch.setattr("shapecat.outputs.scene_tree.read_finished", lambda _: finished)
-    rows: Any = [SimpleNamespace(track=k, category="cup", confidence=0.9) for k in labels]
 
     for topic, shown in (("/b", {7}), ("/a", {5, 6})):
         text = describe_scene(tmp_path, 3, topic=topic)
         assert {track for track in labels if f"#{track}:" in text} == shown
         assert len(text.splitlines()) == 2 + len(shown)  # below two planes
         choice: Any = SimpleNamespace(frames=[(topic, 3)])
-        (frame,) = _frames(finished, rows, choice)
+        (frame,) = _frames(finished, choice)
         assert {item.track for item in frame.objects} == shown
 
 

@@ -172,10 +172,10 @@ def test_names_are_escaped_in_page(run: Path) -> None:
     (run / "tracks.csv").write_text("\n".join(table) + "\n")
     timelines = read_timelines(run)
     rows = read_track_table(run / "tracks.csv")
-    finished = FinishedRun(run, info, {})
+    finished = FinishedRun(run, info, rows, {})
 
     text = run_page(
-        finished, rows, [Card(r, timelines[r.track], None) for r in rows.rows], [], {}, length_s=1.0
+        finished, [Card(r, timelines[r.track], None) for r in rows.rows], [], {}, length_s=1.0
     )
 
     assert "<img src=x" not in text
@@ -565,7 +565,7 @@ def many_tracks(folder: Path, count: int) -> str:
         ("track", "category", "confidence", "label"), tuple(c.row for c in cards), ()
     )
     return run_page(
-        FinishedRun(folder, read_finished(folder).info, {}), table, cards, [], {}, length_s=1.0
+        FinishedRun(folder, read_finished(folder).info, table, {}), cards, [], {}, length_s=1.0
     )
 
 

@@ -37,7 +37,7 @@ from shapecat.outputs.report.tracks import Detected, Timeline, read_timelines
 from shapecat.outputs.report.writing import RunReport, _faces, read_report
 from shapecat.runs.finished import FinishedRun, read_finished
 from shapecat.runs.labels.meaning import TrackLabel
-from shapecat.runs.labels.track_table import TrackRow, TrackTable, read_track_table
+from shapecat.runs.labels.track_table import TrackRow, TrackTable
 from shapecat.runs.tables.schemas import FRAMES, TRACKS
 from shapecat.types import (
     Box,
@@ -164,12 +164,11 @@ def test_run_page_has_right_values(*, served: bool) -> None:
         "color": {"/d": "/rgb", "/e": "/rgb", "/f": None},  # sensors may share a colour camera
         "versions": {"shapecat": "1.2", "python": "3.13"},
     }
-    lab = FinishedRun(Path("out/my lab"), info, {17: TrackLabel(17, "mug", 1.0)})
-    row = worked_card().row
-    table = TrackTable(("track", "label"), (row,), ())
+    table = TrackTable(("track", "label"), (worked_card().row,), ())
+    lab = FinishedRun(Path("out/my lab"), info, table, {17: TrackLabel(17, "mug", 1.0)})
     stages = {"detect": np.array([0.0021, 0.0042, 0.1044]), "rest": np.array([])}
     text = run_page(
-        lab, table, [worked_card()], [], stages,
+        lab, [worked_card()], [], stages,
         length_s=4.3, notes=["a note"], index="../i.html", served=served,
     )  # fmt: skip
     facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", text.partition("Glossary")[0]))
@@ -215,18 +214,14 @@ def test_run_page_has_right_values(*, served: bool) -> None:
 def test_stages_are_in_milliseconds_and_phases_in_seconds(run: Path) -> None:
     finished = read_finished(run)
     finished.info["seconds"] = {"perceive": 12.34}
-    table = read_track_table(run / "tracks.csv")
-    text = run_page(
-        finished, table, [], [], {"detect": np.array([0.002, 0.004, 0.104])}, length_s=1.0
-    )
+    text = run_page(finished, [], [], {"detect": np.array([0.002, 0.004, 0.104])}, length_s=1.0)
 
     assert "<td>detect</td><td>4.0</td><td>94.0</td></tr>" in text
     assert "<td>perceive</td><td>12.3</td><td></td></tr>" in text
 
 
 def test_page_without_tracks_does_not_blame_the_filter(run: Path) -> None:
-    table = read_track_table(run / "tracks.csv")
-    text = run_page(read_finished(run), table, [], [], {}, length_s=1.0)
+    text = run_page(read_finished(run), [], [], {}, length_s=1.0)
 
     assert "No objects were found." in text
     assert "filter." not in text.partition("<script")[0]
@@ -249,8 +244,7 @@ def test_timelines_end_with_the_last_track(run: Path) -> None:
         )
         for track, at in ends.items()
     ]
-    table = read_track_table(run / "tracks.csv")
-    text = run_page(read_finished(run), table, cards, [], {}, length_s=9.0)
+    text = run_page(read_finished(run), cards, [], {}, length_s=9.0)
     lines = re.findall(r'<polyline points="([^"]+)"', text)
 
     assert [line.split()[0].split(",")[0] for line in lines[::3]] == ["48", "24", "144"]

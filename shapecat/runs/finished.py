@@ -10,8 +10,9 @@ from shapecat.recordings import Recording, open_recording
 from shapecat.runs.folder import read_run
 from shapecat.runs.identity import content_digest, same_content
 from shapecat.runs.labelled_frames import read_labelled_frames
-from shapecat.runs.labels.corrections import read_labels
+from shapecat.runs.labels.corrections import read_labelled_table
 from shapecat.runs.labels.meaning import TrackLabel
+from shapecat.runs.labels.track_table import TrackTable
 from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import require_utf8
 from shapecat.types import UNKNOWN, LabelledFrame
@@ -21,7 +22,7 @@ __all__ = ["FinishedRun", "find_runs", "find_usable", "open_source", "read_finis
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run folder, with the content of run.json and the final label of each track.
+    """A run folder, with the content of run.json and tracks.csv, and the final label of each track.
 
     ``common`` holds the categories of all runs that are exported together, so that categories have
     the same order in each run; it is empty except in exports.
@@ -29,6 +30,7 @@ class FinishedRun:
 
     folder: Path
     info: RunInfo
+    table: TrackTable
     labels: Mapping[int, TrackLabel]
     common: tuple[str, ...] = ()
 
@@ -59,15 +61,15 @@ class FinishedRun:
 
 
 def read_finished(folder: Path) -> FinishedRun:
-    """Read run.json and the labels of a run folder.
+    """Read run.json and tracks.csv of a run folder.
 
     Raises
     ------
     OutputError : the folder is not a finished run, or its tracks.csv is invalid.
     """
     info = read_run(folder)
-    labels = read_labels(folder / "tracks.csv", info["model"]["categories"])
-    return FinishedRun(folder, info, labels)
+    table, labels = read_labelled_table(folder / "tracks.csv", info["model"]["categories"])
+    return FinishedRun(folder, info, table, labels)
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:

@@ -20,7 +20,6 @@ from shapecat.outputs.wording import different_names
 from shapecat.recordings import MessageError
 from shapecat.recordings.decoding.colour_image import encoded, pixels_of
 from shapecat.runs.finished import FinishedRun, open_source
-from shapecat.runs.labels.track_table import read_track_table
 from shapecat.system.progress import Observer, ignore, observed
 from shapecat.types import UNKNOWN, Frame, LabelledFrame, LabelledObject
 
@@ -138,8 +137,7 @@ def images_of(
     OutputError : the content of the recording has changed.
     RecordingError : the recording is missing or unreadable.
     """
-    labels = read_track_table(finished.folder / "tracks.csv").labels
-    corrected = {track for track, label in labels.items() if label}
+    corrected = {track for track, label in finished.table.labels.items() if label}
     chosen = _chosen(finished, selection, corrected)
     with open_source(finished.info, recording) as source:
         every = observed(finished.frames(), "export", None, observe)

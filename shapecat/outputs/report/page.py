@@ -52,7 +52,6 @@ class Listed:
 
 def run_page(
     finished: FinishedRun,
-    table: TrackTable,
     cards: Sequence[Card],
     frames: Sequence[StripFrame],
     stages: Mapping[str, F8],
@@ -66,7 +65,7 @@ def run_page(
 
     Parameters
     ----------
-    cards : the tracks, in the order of ``table``.
+    cards : the tracks, in the order of the table.
     frames : the frames of the strip.
     stages : (frames,) seconds of each stage.
     length_s : time from the first to the last frame, seconds.
@@ -107,7 +106,7 @@ def run_page(
         facts=_facts(run),
         glossary=asset("glossary.html"),
         names="".join(f'<option value="{escape(name)}">' for name in names),
-        data=_data(names, run, table, served=served),
+        data=_data(names, run, finished.table, served=served),
     )
 
 

@@ -25,7 +25,6 @@ from shapecat.outputs.report.surfaces import MOST_POINTS, Snapshot, SurfaceDrawi
 from shapecat.runs.finished import FinishedRun, open_source
 from shapecat.runs.labelled_frames import read_labelled_frames
 from shapecat.runs.labels.meaning import TrackLabel
-from shapecat.runs.labels.track_table import TrackRow
 from shapecat.types import Frame, LabelledFrame, LabelledObject, NeuralGas
 
 __all__ = ["Pictures", "StripFrame", "TrackPictures", "take_pictures"]
@@ -115,31 +114,29 @@ class _Collector:
         return Pictures(tracks, sorted(self.frames, key=lambda frame: frame.seconds), reason)
 
 
-def take_pictures(finished: FinishedRun, rows: Sequence[TrackRow], choice: Choice) -> Pictures:
+def take_pictures(finished: FinishedRun, choice: Choice) -> Pictures:
     """Read the frames of a choice again and make the pictures.
 
     If the recording cannot be read, tracks get only drawings of their meshes, and there is no
-    overview strip. ``rows`` are those of tracks.csv; their corrections are not used.
+    overview strip. Corrections are not used.
     """
     collector = _Collector(choice)
     advice = "run `shapecat annotate` with --recording PATH first"
     try:
         with open_source(finished.info, advice=advice) as recording:
-            frames = _frames(finished, rows, choice)
-            for item in with_colour(frames, recording, finished.info):
+            for item in with_colour(_frames(finished, choice), recording, finished.info):
                 collector.add(*item)
     except ShapecatError as error:
         collector = _Collector(choice)
-        for labelled in _frames(finished, rows, choice):
+        for labelled in _frames(finished, choice):
             collector.add(labelled, None, None)
         return collector.pictures(str(error))
     return collector.pictures()
 
 
-def _frames(
-    finished: FinishedRun, rows: Sequence[TrackRow], choice: Choice
-) -> Iterator[LabelledFrame]:
-    """Yield the frames of a choice; tracks have the category in ``rows``, without corrections."""
+def _frames(finished: FinishedRun, choice: Choice) -> Iterator[LabelledFrame]:
+    """Yield the frames of a choice; tracks have their own category, without corrections."""
+    rows = finished.table.rows
     labels = {row.track: TrackLabel(row.track, row.category, row.confidence) for row in rows}
     left = set(choice.frames)
     for labelled in read_labelled_frames(finished.folder, labels):

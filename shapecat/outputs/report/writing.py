@@ -23,7 +23,6 @@ from shapecat.outputs.report.surfaces import recoloured
 from shapecat.outputs.report.tracks import Timeline, read_length, read_stage_seconds, read_timelines
 from shapecat.runs.finished import find_runs, read_finished
 from shapecat.runs.folder import require_work
-from shapecat.runs.labels.corrections import read_labelled_table
 from shapecat.runs.labels.meaning import TrackLabel
 from shapecat.runs.labels.track_table import TrackTable
 from shapecat.system.files import replacing
@@ -73,11 +72,10 @@ class RunReport:
         OutputError : the tracks.csv of the run is invalid, or the run has been replaced.
         """
         require_work(self.folder, self.work)
-        table = self._table
+        finished = read_finished(self.folder)
         return run_page(
-            read_finished(self.folder),
-            table,
-            self._cards(table),
+            finished,
+            self._cards(finished.table),
             self.pictures.frames,
             self.stages,
             length_s=self.length_s,
@@ -93,7 +91,8 @@ class RunReport:
         ------
         OutputError : the tracks.csv of the run is invalid, or the run is gone.
         """
-        finished, cards = read_finished(self.folder), self._cards(self._table)
+        finished = read_finished(self.folder)
+        cards = self._cards(finished.table)
         return Listed(
             link=link,
             name=finished.name,
@@ -108,10 +107,6 @@ class RunReport:
         """Warnings about the page, in addition to those of the run."""
         reason = self.pictures.reason
         return [f"surfaces are drawn from their meshes, without points: {reason}"] if reason else []
-
-    @property
-    def _table(self) -> TrackTable:
-        return read_labelled_table(self.folder / "tracks.csv")[0]
 
     def _cards(self, table: TrackTable) -> list[Card]:
         return [
@@ -225,9 +220,8 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
     OutputError : the folder is not a finished run, or its tracks.csv is invalid.
     """
     finished = read_finished(folder)
-    rows = read_labelled_table(folder / "tracks.csv")[0].rows
     timelines = read_timelines(folder)
-    pictures = take_pictures(finished, rows, choose_frames(folder, timelines))
+    pictures = take_pictures(finished, choose_frames(folder, timelines))
     work, stages = finished.info["work"], read_stage_seconds(folder)
     return RunReport(folder, work, timelines, pictures, stages, read_length(folder), index)
 

@@ -45,7 +45,14 @@ _MOST_PROBLEMS = 20
 
 
 def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLabel]:
-    """Read the final label of each track; deleted tracks are missing.
+    """Read the final label of each track, as `read_labelled_table` does."""
+    return read_labelled_table(path, categories)[1]
+
+
+def read_labelled_table(
+    path: Path, categories: Iterable[str] = ()
+) -> tuple[TrackTable, dict[int, TrackLabel]]:
+    """Read the tracks.csv of a run, and the final label of each track; deleted tracks have none.
 
     A label that a person filled in replaces the category and has confidence 1. Two tracks can be
     merged if they have a topic in common, or if run.json beside the table has a fixed frame.
@@ -59,13 +66,13 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
     OutputError : the table is unreadable, belongs to another run, or has invalid lines, which the
         error message lists.
     """
-    table, problems = read_labelled_table(path)
+    table, problems = _restored(path)
     labels, misread = resolve_labels(table.rows, categories, one_frame=_one_frame(path.parent))
     _refuse(path, [*problems, *_lines(table.rows, misread)], "the table cannot be used")
-    return labels
+    return table, labels
 
 
-def read_labelled_table(path: Path) -> tuple[TrackTable, list[str]]:
+def _restored(path: Path) -> tuple[TrackTable, list[str]]:
     """Read the tracks.csv of a run, and restore what a person must not change.
 
     Labels and added columns are from tracks.csv, other cells and the order from
@@ -160,7 +167,7 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
 
 def _adopt(corrected: Path, folder: Path) -> None:
     current = folder / "tracks.csv"
-    before, problems = read_labelled_table(current)
+    before, problems = _restored(current)
     result = before
     if not (corrected.exists() and corrected.samefile(current)):
         _refuse(current, problems)
@@ -194,7 +201,7 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
         written.
     """
     current = folder / "tracks.csv"
-    base, problems = read_labelled_table(current)
+    base, problems = _restored(current)
     categories, one_frame = read_run(folder)["model"]["categories"], _one_frame(folder)
     before = find_misread(base.rows, categories, one_frame=one_frame)
     _refuse(current, [*problems, *_lines(base.rows, before)])
