@@ -5,7 +5,7 @@ YOLO, with a line per object: class, then x and y of each corner, relative to th
 """
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from shapecat.colour.outline import joined, outlines
 from shapecat.colour.rle import rle_counts, rle_text
 from shapecat.outputs.exports.dataset_frames import DatasetImage
 from shapecat.runs.finished import FinishedRun
+from shapecat.types import LabelledObject
 
 __all__ = ["DATASETS", "write_coco", "write_yolo"]
 
@@ -41,32 +42,21 @@ def write_coco(out: Path, images: Images, categories: Sequence[str]) -> int:
         for item, mask, sure in image.objects:
             track = tracks.setdefault((str(finished.folder), item.track), len(tracks) + 1)
             size = [image.height, image.width]
-            part["annotations"].append(
-                {
-                    "id": len(part["annotations"]) + 1,
-                    "image_id": number,
-                    "category_id": categories.index(item.category) + 1,
-                    "bbox": list(map(float, mask.box)),
-                    "area": float(mask.area),
-                    "segmentation": {"size": size, "counts": rle_text(rle_counts(mask, *size))},
-                    "iscrowd": int(not sure),
-                    "track_id": track,
-                    "score": round(item.confidence, 4),
-                    "attributes": {
-                        "run": finished.name,
-                        "track": item.track,
-                        "occluded": item.occluded,
-                        "truncated": item.touches_border,
-                    },
-                }
-            )
+            annotation = {
+                "id": len(part["annotations"]) + 1,
+                "image_id": number,
+                "category_id": categories.index(item.category) + 1,
+                "bbox": list(map(float, mask.box)),
+                "area": float(mask.area),
+                "segmentation": {"size": size, "counts": rle_text(rle_counts(mask, *size))},
+                "iscrowd": int(not sure),
+                "track_id": track,
+                "score": round(item.confidence, 4),
+                "attributes": _attributes(finished, item),
+            }
+            part["annotations"].append(annotation)
             count += sure
-    named = [{"id": k, "name": name, "supercategory": ""} for k, name in enumerate(categories, 1)]
-    (out / "annotations").mkdir(exist_ok=True)
-    for split, part in splits.items():
-        content = {"info": {"description": "shapecat"}, "licenses": [], "categories": named, **part}
-        path = out / "annotations" / f"instances_{split}.json"
-        path.write_text(json.dumps(content), "utf-8")
+    _write_splits(out / "annotations", splits, categories)
     return count
 
 
@@ -83,6 +73,26 @@ def _coco_image(number: int, finished: FinishedRun, image: DatasetImage) -> dict
         "frame": labelled.index,
         "stamp_ns": labelled.stamp_ns,
     }
+
+
+def _attributes(finished: FinishedRun, item: LabelledObject) -> dict[str, Any]:
+    return {
+        "run": finished.name,
+        "track": item.track,
+        "occluded": item.occluded,
+        "truncated": item.touches_border,
+    }
+
+
+def _write_splits(
+    folder: Path, splits: Mapping[str, Mapping[str, Any]], categories: Sequence[str]
+) -> None:
+    """Write instances_SPLIT.json with the images and annotations of each split."""
+    named = [{"id": k, "name": name, "supercategory": ""} for k, name in enumerate(categories, 1)]
+    folder.mkdir(exist_ok=True)
+    for split, part in splits.items():
+        content = {"info": {"description": "shapecat"}, "licenses": [], "categories": named, **part}
+        (folder / f"instances_{split}.json").write_text(json.dumps(content), "utf-8")
 
 
 def write_yolo(out: Path, images: Images, categories: Sequence[str]) -> int:
