@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
+from shapecat.arrays import F4, Bool
 from shapecat.config import Settings
 from shapecat.errors import ConfigError
 from shapecat.geometry import unit_direction
@@ -50,17 +51,38 @@ def frame_of(reading: ArrayLike | Frame, intrinsics: ArrayLike | Camera | None =
     masked = np.ma.getmaskarray(reading if isinstance(reading, np.ma.MaskedArray) else values)
     frame = partial(Frame, topic="", index=0, stamp_ns=0, log_time_ns=0, frame_id="")
     if intrinsics is None:
-        if values.dtype.kind not in "fiu" or values.ndim not in {2, 3} or values.shape[-1] != 3:
-            msg = f"expected points (n, 3), or a depth image with intrinsics, got {values.shape}"
-            raise ConfigError(msg)
-        points = values.reshape(-1, 3).astype(np.float32, order="C")
-        finite = np.isfinite(points).all(axis=1) & ~masked.reshape(-1, 3).any(axis=1)
-        points[~finite] = np.nan
-        sample = points[finite][:: 1 + len(points) // 10_000]  # enough for their median
-        if sample.size and np.median(np.abs(sample).max(axis=1)) > _FARTHEST_M:
-            msg = "expected points in metres, near the sensor; divide millimetres by 1000"
-            raise ConfigError(msg)
-        return frame(points=points)
+        return frame(points=_points(values, masked))
+    depth = _depth(values, masked)
+    return frame(depth=depth, camera=_camera(intrinsics, *depth.shape))
+
+
+def _points(values: np.ndarray, masked: Bool) -> F4:
+    """Return points (n, 3) as float32, NaN where a coordinate is masked or not finite.
+
+    Raises
+    ------
+    ConfigError : the shape or the type is wrong, or the unit is not metres.
+    """
+    if values.dtype.kind not in "fiu" or values.ndim not in {2, 3} or values.shape[-1] != 3:
+        msg = f"expected points (n, 3), or a depth image with intrinsics, got {values.shape}"
+        raise ConfigError(msg)
+    points = values.reshape(-1, 3).astype(np.float32, order="C")
+    finite = np.isfinite(points).all(axis=1) & ~masked.reshape(-1, 3).any(axis=1)
+    points[~finite] = np.nan
+    sample = points[finite][:: 1 + len(points) // 10_000]  # enough for their median
+    if sample.size and np.median(np.abs(sample).max(axis=1)) > _FARTHEST_M:
+        msg = "expected points in metres, near the sensor; divide millimetres by 1000"
+        raise ConfigError(msg)
+    return points
+
+
+def _depth(values: np.ndarray, masked: Bool) -> F4:
+    """Return a depth image (h, w) in metres, 0 where it is masked or not measured.
+
+    Raises
+    ------
+    ConfigError : the shape or the type is wrong, or the unit is not metres.
+    """
     if values.dtype.kind not in "fiu" or values.ndim != 2:
         msg = f"expected a depth image (h, w) of numbers, got {values.dtype} {values.shape}"
         raise ConfigError(msg)
@@ -69,7 +91,7 @@ def frame_of(reading: ArrayLike | Frame, intrinsics: ArrayLike | Camera | None =
     if depth.any() and np.median(depth[depth > 0]) > _FARTHEST_M:
         msg = "expected depth in metres; divide millimetres by 1000, or pass integers"
         raise ConfigError(msg)
-    return frame(depth=depth, camera=_camera(intrinsics, *depth.shape))
+    return depth
 
 
 def _camera(intrinsics: ArrayLike | Camera, height: int, width: int) -> Camera:
