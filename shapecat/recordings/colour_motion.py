@@ -53,29 +53,45 @@ def view_at_its_time(
     if start_ns == end_ns or lens is None:
         return view
     buffer = transforms().around(frame.log_time_ns, start_ns)
-
-    def motion_of(frame_id: str) -> Pose:
-        """Return the pose of a frame at the first stamp relative to itself at the second."""
-        start, end = (buffer.lookup(fixed_frame, frame_id, ns) for ns in (start_ns, end_ns))
-        return compose(inverse(end), start)
-
     pose = view.colour_from_depth or IDENTITY
     with suppress(TransformError):
         if not view.registered and _is_placed(buffer, view.image.frame_id, frame.frame_id):
-            motion = motion_of(view.image.frame_id)
+            motion = _motion(buffer, fixed_frame, view.image.frame_id, start_ns, end_ns)
             moved = compose(motion, pose)
         else:
-            # The two cameras are assumed rigid. The axes of the data may differ from those of the
-            # frame in the message.
-            named_from_sensor = compose(
-                inverse(buffer.lookup(fixed_frame, frame.frame_id, start_ns)), fixed_from_sensor
-            )
-            motion = compose(motion_of(frame.frame_id), named_from_sensor)
-            motion = compose(inverse(named_from_sensor), motion)
+            # The two cameras are assumed rigid.
+            motion = _sensor_motion(buffer, fixed_frame, frame, fixed_from_sensor, end_ns)
             moved = compose(pose, motion)
         if _pixels(motion, lens.pinhole.fx) >= _LEAST_PX:
             return replace(view, lens=lens, colour_from_depth=moved)
     return view
+
+
+def _motion(
+    buffer: TransformBuffer, fixed_frame: str, frame_id: str, start_ns: int, end_ns: int
+) -> Pose:
+    """Return the pose of a frame at the first stamp relative to itself at the second.
+
+    Raises
+    ------
+    TransformError : the pose of the frame in the fixed frame is unknown at one of them.
+    """
+    start, end = (buffer.lookup(fixed_frame, frame_id, ns) for ns in (start_ns, end_ns))
+    return compose(inverse(end), start)
+
+
+def _sensor_motion(
+    buffer: TransformBuffer, fixed_frame: str, frame: Frame, fixed_from_sensor: Pose, end_ns: int
+) -> Pose:
+    """Return the motion, as in `_motion`, of the depth sensor from the stamp of its frame.
+
+    The axes of the data may differ from those of the frame that the message names.
+    """
+    named_from_sensor = compose(
+        inverse(buffer.lookup(fixed_frame, frame.frame_id, frame.stamp_ns)), fixed_from_sensor
+    )
+    motion = _motion(buffer, fixed_frame, frame.frame_id, frame.stamp_ns, end_ns)
+    return compose(inverse(named_from_sensor), compose(motion, named_from_sensor))
 
 
 def _is_placed(buffer: TransformBuffer, colour_frame: str, depth_frame: str) -> bool:
