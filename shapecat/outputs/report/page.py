@@ -77,9 +77,6 @@ def run_page(
     tally = count_cards(cards, finished.labels)
     names = (UNKNOWN, *finished.categories)
     end = max((float(c.timeline.seconds[-1]) for c in cards if len(c.timeline.seconds)), default=0)
-    deleted = {card.row.category for card in cards if card.row.track not in finished.labels}
-    filters = tally.categories.keys() | deleted  # a deleted track keeps its filter
-    ordered = [name for name in names if name in filters] + sorted(filters - set(names))
     connect = "'self'" if served else "'none'"
     return template("page.html").substitute(
         title=escape(finished.name),
@@ -98,7 +95,7 @@ def run_page(
         ),
         warnings=_warnings([*run["warnings"], *notes]),
         strip=_strip(frames, cards),
-        chips="".join(_chip(name, tally.categories[name]) for name in ordered),
+        chips=_chips(finished, cards, tally),
         cards="".join(card_html(card, run["model"]["categories"], names, end) for card in cards),
         empty="No track fits this filter." if cards else "No objects were found.",
         next=_next_step(finished, served=served),
@@ -163,6 +160,15 @@ def _strip(frames: Sequence[StripFrame], cards: Sequence[Card]) -> str:
     several = len({frame.topic for frame in frames}) > 1
     items = "".join(frame_html(frame, categories, several=several) for frame in frames)
     return f'<section class="strip" id="strip" aria-label="Frames">{items}</section>'
+
+
+def _chips(finished: FinishedRun, cards: Sequence[Card], tally: TrackCounts) -> str:
+    """Return a filter for each category of a track, in the order of the run's categories."""
+    deleted = {card.row.category for card in cards if card.row.track not in finished.labels}
+    filters = tally.categories.keys() | deleted  # a deleted track keeps its filter
+    names = (UNKNOWN, *finished.categories)
+    ordered = [name for name in names if name in filters] + sorted(filters - set(names))
+    return "".join(_chip(name, tally.categories[name]) for name in ordered)
 
 
 def _chip(name: str, count: int) -> str:
