@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from shapecat.batch.ledger import Outcome
     from shapecat.batch.plans import Batch
     from shapecat.recordings import FrameRange
+    from shapecat.runs.jobs import Job
 
 
 @click.command()
@@ -116,24 +118,14 @@ def process(
     *,
     recordings: tuple[str, ...],
     out: str,
-    start_s: float | None,
-    end_s: float | None,
-    every: int,
-    color: str | None,
-    no_color: bool,
-    no_mcap: bool,
-    no_rrd: bool,
-    config: Path | None,
-    overrides: tuple[str, ...],
     jobs: int | None,
     executor: str,
     scheduler: str | None,
     shard: str | None,
     no_fsync: bool,
-    boxes: str | None,
     progress: str,
     as_json: bool,
-    **choices: Any,
+    **options: Any,
 ) -> None:
     """Find, categorize and track the objects in recordings.
 
@@ -152,36 +144,16 @@ def process(
     """
     # Load these heavy libraries only when there is work, so that --help stays fast.
     from shapecat.batch.plans import plan_batch
-    from shapecat.config import load_settings
     from shapecat.errors import common_exit_code
-    from shapecat.runs.jobs import Job
     from shapecat.system.files import FSYNC
 
-    if color is not None and no_color:
-        msg = "--color and --no-color contradict each other"
-        raise click.UsageError(msg)
-    if choices["discard_labels"] and not choices["overwrite"]:
-        msg = "--discard-labels needs --overwrite: without it, labels stay with their results"
-        raise click.UsageError(msg)
-    frame_range = _frame_range(start_s, end_s, every)
+    job = _job(**options)
     if no_fsync:
         os.environ[FSYNC] = "0"  # which worker processes inherit
     if executor != "local":  # its workers may have another current folder
         recordings, out = tuple(map(_absolute, recordings)), _absolute(out)
-        if choices["model"] is not None:
-            choices["model"] = choices["model"].absolute()
-    if boxes is not None:
-        overrides = (*overrides, f"outputs.boxes={boxes}")
-    job = Job(
-        source=Path(),
-        folder=Path(),
-        settings=load_settings(config, overrides),
-        frame_range=frame_range,
-        color="" if no_color else color,
-        mcap=not no_mcap,
-        rrd=not no_rrd,
-        **choices,
-    )
+        if job.model is not None:
+            job = replace(job, model=job.model.absolute())
     with plan_batch(job, recordings, out, shard=shard) as batch:
         display = open_progress(progress, batch.tasks)
         tally = Outcomes(keep_all=as_json)
@@ -194,6 +166,45 @@ def process(
         else:
             print_closing(batch.tasks, tally)
     ctx.exit(common_exit_code(tally.codes))
+
+
+def _job(
+    *,
+    start_s: float | None,
+    end_s: float | None,
+    every: int,
+    color: str | None,
+    no_color: bool,
+    no_mcap: bool,
+    no_rrd: bool,
+    boxes: str | None,
+    config: Path | None,
+    overrides: tuple[str, ...],
+    **choices: Any,
+) -> "Job":
+    """Return the job that all recordings have in common; refuse options that contradict others."""
+    from shapecat.config import load_settings
+    from shapecat.runs.jobs import Job
+
+    if color is not None and no_color:
+        msg = "--color and --no-color contradict each other"
+        raise click.UsageError(msg)
+    if choices["discard_labels"] and not choices["overwrite"]:
+        msg = "--discard-labels needs --overwrite: without it, labels stay with their results"
+        raise click.UsageError(msg)
+    frame_range = _frame_range(start_s, end_s, every)
+    if boxes is not None:
+        overrides = (*overrides, f"outputs.boxes={boxes}")
+    return Job(
+        source=Path(),
+        folder=Path(),
+        settings=load_settings(config, overrides),
+        frame_range=frame_range,
+        color="" if no_color else color,
+        mcap=not no_mcap,
+        rrd=not no_rrd,
+        **choices,
+    )
 
 
 def _absolute(place: str) -> str:
