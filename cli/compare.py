@@ -42,10 +42,10 @@ def compare(
     shapecat compare results/lab results-before/lab --out differences
     """
     from shapecat.evaluation.comparison import compare as compare_run
-    from shapecat.evaluation.comparison.page import figure_rows, require_new, write_comparison
+    from shapecat.evaluation.comparison.page import figure_rows, prepare_new, write_comparison
 
     if out is not None:
-        require_new(out)
+        prepare_new(out)
     with progress_bars() as bars:
         comparison = compare_run(run, truth, recording=recording, observe=bars)
     if out is not None:

@@ -35,11 +35,11 @@ from shapecat.runs.jobs import (
     describe_differences,
     describe_run,
     differences,
+    discard_if_changed,
     identify,
     require_model,
     require_other_folder,
     require_start_in_recording,
-    require_unchanged,
     summarize,
     update_place,
 )
@@ -130,7 +130,7 @@ def _run_phases(work: Work, content: ContentDigest, begun: float) -> None:
     earlier_s = run["seconds"].pop("total", None) or sum(run["seconds"].values())
     _run_once("perceive", folder, run, lambda: perceive_all(work))
     _run_once("revise", folder, run, lambda: _revise_and_warn(work))
-    require_unchanged(folder, run, job.source)  # or a resumed run could mix two recordings
+    discard_if_changed(folder, run, job.source)  # or a resumed run could mix two recordings
     identify(run, content)
     write_run(folder, run)
     discard_segments(folder)
@@ -139,7 +139,7 @@ def _run_phases(work: Work, content: ContentDigest, begun: float) -> None:
         forget_old_labels(folder, run, job)
         _run_once("labels", folder, run, lambda: keep_labels(folder, run, job))
         annotate(folder, work.recording, run, observe)
-    require_unchanged(folder, run, job.source)
+    discard_if_changed(folder, run, job.source)
     run["seconds"]["compile"] = compiling_s
     run["seconds"]["total"] = earlier_s + time.perf_counter() - begun
     write_run(folder, run)

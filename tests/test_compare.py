@@ -49,7 +49,7 @@ from shapecat.evaluation.comparison.page import (
     figure_rows,
     format_page,
     place_captions,
-    require_new,
+    prepare_new,
     write_comparison,
 )
 from shapecat.evaluation.comparison.pictures import (
@@ -1488,7 +1488,7 @@ def test_current_folder_as_output_is_refused_before_the_work(
     monkeypatch.chdir(tmp_path)
 
     with pytest.raises(OutputError, match="name a file or folder in it"):
-        require_new(Path())
+        prepare_new(Path())
 
 
 def test_split_object_is_visible_in_the_picture() -> None:

@@ -15,7 +15,7 @@ from shapecat.errors import OutputError
 from shapecat.recordings import FrameRange
 from shapecat.runs.folder import previous_path, read_run, write_run
 from shapecat.runs.identity import file_stats
-from shapecat.runs.jobs import Job, require_unchanged
+from shapecat.runs.jobs import Job, discard_if_changed
 from shapecat.runs.labels.track_table import read_track_table
 from shapecat.runs.tables.segments import list_segments
 from shapecat.system.files import partial_path
@@ -331,12 +331,12 @@ def test_labels_given_until_the_run_is_replaced_are_transferred(
     checks = []
 
     def check(*arguments: Any) -> None:
-        require_unchanged(*arguments)
+        discard_if_changed(*arguments)
         checks.append(arguments)
         if len(checks) == 2:  # after the outputs
             give_label(job.folder, "vase")
 
-    monkeypatch.setattr(pipeline, "require_unchanged", check)
+    monkeypatch.setattr(pipeline, "discard_if_changed", check)
     summary = pipeline.process(job)
 
     assert labels(job.folder) == {"vase"}

@@ -17,7 +17,7 @@ from shapecat.runs.perceive.selection import read_frames
 from shapecat.runs.run_info import RunInfo
 from shapecat.types import Frame, LabelledFrame
 
-__all__ = ["Coloured", "ExportedFrame", "with_colour"]
+__all__ = ["Coloured", "PairedFrame", "with_colour"]
 
 _AHEAD = 4
 """Number of labelled frames that are read in advance."""
@@ -31,13 +31,13 @@ class Coloured:
     masks: tuple[Mask, ...]
 
 
-ExportedFrame = tuple[LabelledFrame, Frame, Coloured | None]
+PairedFrame = tuple[LabelledFrame, Frame, Coloured | None]
 """A labelled frame, its depth image or cloud, and its colour image if it has one."""
 
 
 def with_colour(
     labelled: Iterable[LabelledFrame], recording: Recording, run: RunInfo
-) -> Iterator[ExportedFrame]:
+) -> Iterator[PairedFrame]:
     """Pair labelled frames with the frames and colour images of the recording.
 
     From an indexed file, only the requested frames are read.

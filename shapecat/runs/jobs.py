@@ -32,11 +32,11 @@ __all__ = [
     "describe_differences",
     "describe_run",
     "differences",
+    "discard_if_changed",
     "identify",
     "require_model",
     "require_other_folder",
     "require_start_in_recording",
-    "require_unchanged",
     "summarize",
     "update_place",
 ]
@@ -283,7 +283,7 @@ def require_model(job: Job, categorizer: Categorizer) -> None:
         raise ModelError(msg)
 
 
-def require_unchanged(folder: Path, run: RunInfo, source: Path) -> None:
+def discard_if_changed(folder: Path, run: RunInfo, source: Path) -> None:
     """Remove the results if the recording has changed since it was read.
 
     Raises

@@ -26,7 +26,7 @@ __all__ = [
     "figure_rows",
     "format_page",
     "place_captions",
-    "require_new",
+    "prepare_new",
     "write_comparison",
 ]
 
@@ -53,7 +53,7 @@ OBJECTS = pa.schema(
 """One row per true object, with the detection matched to it, and one per unmatched detection."""
 
 
-def require_new(folder: Path) -> None:
+def prepare_new(folder: Path) -> None:
     """Check that a folder is new or empty, and create its parent, before the work begins.
 
     Raises
@@ -77,7 +77,7 @@ def write_comparison(folder: Path, found: Comparison) -> None:
     ------
     OutputError : the folder is not empty, or cannot be written.
     """
-    require_new(folder)
+    prepare_new(folder)
     columns = zip(*found.rows, strict=True) if found.rows else ([] for _ in Difference._fields)
     table = dict(zip(Difference._fields, map(list, columns), strict=True))
     failing = explained(f"{folder}: cannot be written", OutputError)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import xxhash
 
 from shapecat.errors import OutputError, explained
-from shapecat.outputs.colouring import ExportedFrame
+from shapecat.outputs.colouring import PairedFrame
 from shapecat.outputs.level_clouds import upright_cloud, write_pcd
 from shapecat.outputs.wording import different_names, safe_name
 from shapecat.runs.finished import FinishedRun
@@ -66,7 +66,7 @@ class Origin(NamedTuple):
         return self.source if is_whole else f"{self.source}.{self.start_s:.3f}-{self.end_s:.3f}"
 
 
-def write_crops(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
+def write_crops(out: Path, frames: Iterable[PairedFrame], finished: FinishedRun) -> int:
     """Add the views of a run to a data set; return their number.
 
     Earlier views of the same topics of the recording are replaced if the run covers their time

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from shapecat.errors import OutputError
-from shapecat.outputs.colouring import ExportedFrame, with_colour
+from shapecat.outputs.colouring import PairedFrame, with_colour
 from shapecat.outputs.exports.coco import DATASETS
 from shapecat.outputs.exports.crops import write_crops
 from shapecat.outputs.exports.dataset_frames import (
@@ -43,7 +43,7 @@ __all__ = [
     "export_run",
 ]
 
-Write = Callable[[Path, Iterable[ExportedFrame], FinishedRun], int]
+Write = Callable[[Path, Iterable[PairedFrame], FinishedRun], int]
 """A function that writes the frames of a run, each with its depth and colour images, into a folder,
 and returns the number of objects written."""
 

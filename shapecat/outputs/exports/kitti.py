@@ -21,7 +21,7 @@ from shapecat.cameras.colour import LensCamera
 from shapecat.colour.projection import project, rectified
 from shapecat.errors import OutputError
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
-from shapecat.outputs.colouring import Coloured, ExportedFrame
+from shapecat.outputs.colouring import Coloured, PairedFrame
 from shapecat.recordings import MessageError
 from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.runs.finished import FinishedRun
@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 _VELO_FROM_RECTIFIED = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def write_kitti(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
+def write_kitti(out: Path, frames: Iterable[PairedFrame], finished: FinishedRun) -> int:
     """Write label_2/, calib/ and velodyne/, with six-digit names; return the number of objects.
 
     Colour images are written to image_2/ as undistorted PNG. ``frames.csv`` maps each

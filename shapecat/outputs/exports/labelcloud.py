@@ -13,7 +13,7 @@ import numpy as np
 
 from shapecat.arrays import F8
 from shapecat.geometry import box_corners, gravity_rotation, rotation_from_quaternion
-from shapecat.outputs.colouring import ExportedFrame
+from shapecat.outputs.colouring import PairedFrame
 from shapecat.outputs.colours import hex_colour
 from shapecat.outputs.level_clouds import write_pcd
 from shapecat.runs.finished import FinishedRun
@@ -24,7 +24,7 @@ __all__ = ["write_labelcloud"]
 _FORMATS = ("centroid_rel", "centroid_abs", "vertices")
 
 
-def write_labelcloud(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
+def write_labelcloud(out: Path, frames: Iterable[PairedFrame], finished: FinishedRun) -> int:
     """Write pointclouds/ and labels/ of a labelCloud project; return the number of objects.
 
     labels/ has the format ``centroid_rel``; labels_centroid_abs/ and labels_vertices/ hold the same

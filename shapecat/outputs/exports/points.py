@@ -15,7 +15,7 @@ import numpy as np
 
 from shapecat.arrays import F4, U2, U4
 from shapecat.errors import OutputError
-from shapecat.outputs.colouring import ExportedFrame
+from shapecat.outputs.colouring import PairedFrame
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.png import png
 from shapecat.runs.finished import FinishedRun
@@ -27,7 +27,7 @@ _LARGEST = 65535
 _INDEX = ("number", "topic", "frame", "stamp_ns", "width", "height", "fx", "fy", "cx", "cy")
 
 
-def write_point_labels(out: Path, frames: Iterable[ExportedFrame], finished: FinishedRun) -> int:
+def write_point_labels(out: Path, frames: Iterable[PairedFrame], finished: FinishedRun) -> int:
     """Write the labels of all points; return the number of objects.
 
     Depth images give depth/ (millimetres), semantic/ and instance/ as 16-bit PNG. Clouds give
