@@ -867,7 +867,7 @@ def test_full_disk_leaves_no_partial_line(tmp_path: Path, monkeypatch: pytest.Mo
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("shapecat.batch.manifest.os.write", fill)
+        patch.setattr("shapecat.system.files.os.write", fill)
         with pytest.raises(OutputError, match="No space left"):
             FileManifest(path).record([Entry("b", "b" * 200, "failed")])
     assert path.read_bytes() == whole

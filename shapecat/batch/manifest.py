@@ -5,13 +5,11 @@ so that several shards can write to one file; a line truncated by a crash or a f
 At a URL nothing can be appended: each writer writes files of its own, called parts.
 """
 
-import fcntl
 import json
 import logging
-import os
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,6 +20,7 @@ from uuid import uuid4
 
 from shapecat.batch.storage import Location, content_key, is_url
 from shapecat.errors import OutputError, ShapecatError, explained
+from shapecat.system.files import append_lines
 
 __all__ = [
     "MANIFEST",
@@ -141,9 +140,8 @@ class FileManifest(Manifest):
         return b""
 
     def _append(self, lines: bytes) -> None:
-        failing = explained(f"{self.path}: cannot be written", OutputError)
-        with failing, _appending(self.path) as file:
-            _write(file, lines)
+        with explained(f"{self.path}: cannot be written", OutputError):
+            append_lines(self.path, lines)
 
 
 class RemoteManifest(Manifest):
@@ -310,30 +308,3 @@ def _interned(name: str, value: Any) -> Any:
     """Intern a value that many entries have in common, to save memory."""
     is_shared = name in {"state", "work", "command"} and isinstance(value, str)
     return sys.intern(value) if is_shared else value
-
-
-@contextmanager
-def _appending(path: Path) -> Iterator[int]:
-    """Yield the descriptor of a file open for appending, locked until the block or process ends."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
-    try:
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield file
-    finally:
-        os.close(file)
-
-
-def _write(file: int, content: bytes) -> None:
-    """Append lines, after ending an incomplete last line; undo a write that fails."""
-    size = os.fstat(file).st_size
-    if size and os.pread(file, 1, size - 1) != b"\n":
-        content = b"\n" + content
-    try:
-        written = os.write(file, content)
-        while written < len(content):
-            written += os.write(file, content[written:])
-    except OSError:
-        os.ftruncate(file, size)
-        raise

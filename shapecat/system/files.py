@@ -22,6 +22,7 @@ from shapecat.errors import OutputError, ShapecatError, explained
 __all__ = [
     "FSYNC",
     "BusyError",
+    "append_lines",
     "complete_folder",
     "flush",
     "holding",
@@ -222,3 +223,31 @@ def _remove_unused(folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
     finally:
         os.close(descriptor)
+
+
+def append_lines(path: Path, lines: bytes) -> None:
+    """Append lines to a file under a lock; create the file and its folder if they are missing.
+
+    An incomplete last line of the file is ended first, and a write that fails is undone.
+
+    Raises
+    ------
+    OSError : the file cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
+    try:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+        size = os.fstat(file).st_size
+        if size and os.pread(file, 1, size - 1) != b"\n":
+            lines = b"\n" + lines
+        try:
+            written = os.write(file, lines)
+            while written < len(lines):
+                written += os.write(file, lines[written:])
+        except OSError:
+            os.ftruncate(file, size)
+            raise
+    finally:
+        os.close(file)
