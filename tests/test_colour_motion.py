@@ -22,12 +22,12 @@ from shapecat.recordings.colour_motion import view_at_its_time
 from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.runs.finished import read_finished
 from shapecat.runs.jobs import Job
-from shapecat.runs.tables.masks import read_masks
 from shapecat.simulation import recorder, simulate
 from shapecat.types import Camera, Frame, Pose
 from tests.conftest import Guesser
 from tests.kitti_files import read_labels
 from tests.messages import EPOCH, SECOND
+from tests.track_tables import read_masks
 
 RATE_HZ = 10.0
 EVERY = 5

@@ -33,7 +33,6 @@ from shapecat.pipeline import annotate_again, process
 from shapecat.recordings import FrameRange, open_recording
 from shapecat.runs.finished import open_source, read_finished
 from shapecat.runs.jobs import Job
-from shapecat.runs.tables.masks import read_masks
 from shapecat.types import ImageMasks, LabelledFrame
 from tests.colour_messages import gradient, png, raw
 from tests.conftest import Guesser
@@ -42,6 +41,7 @@ from tests.messages import EPOCH, SECOND, write
 from tests.test_exports import relabel
 from tests.test_recordings_colour import MS, depth_items
 from tests.test_review import TOPIC, labelled_object, rows, scene, stamp
+from tests.track_tables import read_masks
 
 IMAGES = "/camera/color/image_raw/compressed"
 FRAMES = 4

@@ -24,11 +24,11 @@ from shapecat.outputs.exports.formats import export_dataset, export_run
 from shapecat.recordings import MessageError
 from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.runs.finished import read_finished
-from shapecat.runs.tables.masks import read_masks
 from tests.kitti_files import read_calibration, read_labels
 from tests.mcap_files import read_ros
 from tests.test_colour_outputs import IMAGES
 from tests.test_exports import relabel
+from tests.track_tables import read_masks
 
 pytestmark = pytest.mark.usefixtures("snapped_once")
 

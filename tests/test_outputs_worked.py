@@ -6,6 +6,7 @@ import json
 import os
 import zlib
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -77,9 +78,10 @@ from shapecat.runs.labelled_tracks import LabelledTracks
 from shapecat.runs.labels.meaning import TrackLabel, _slips
 from shapecat.runs.labels.track_table import TrackTable
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
-from shapecat.runs.tables.masks import read_nearest_masks
+from shapecat.runs.tables.masks import mask_columns, masks_in, read_nearest_masks
 from shapecat.runs.tables.reading import Key
-from shapecat.runs.tables.schemas import FRAMES
+from shapecat.runs.tables.schemas import FRAMES, MASKS
+from shapecat.runs.tables.writing import arrow_table
 from shapecat.types import (
     AnnotationBox,
     AnnotationFrame,
@@ -225,46 +227,50 @@ def test_lifetime_does_not_span_jump_of_clock(encoding: str) -> None:
             assert encode(annotation)
 
 
-def patch_masks(
-    monkeypatch: pytest.MonkeyPatch, masks: list[tuple[Key, ImageMasks]], stamps: list[int]
-) -> None:
-    """Replace the masks of a run, and the stamps of their frames."""
-    frames = [(key, stamp) for (key, _), stamp in zip(masks, stamps, strict=True)]
-    monkeypatch.setattr("shapecat.runs.tables.masks.read_masks", lambda _folder, **_: iter(masks))
-    monkeypatch.setattr("shapecat.runs.tables.masks.read_stamps", lambda _folder: iter(frames))
+def write_masks(folder: Path, masks: list[tuple[Key, ImageMasks]], stamps: list[int]) -> None:
+    """Write the masks of a run, and the stamps of their frames."""
+    frames = [
+        dict.fromkeys(FRAMES.names) | {"topic": topic, "frame": k, "stamp_ns": stamp}
+        for ((topic, k), _), stamp in zip(masks, stamps, strict=True)
+    ]
+    perceived: Any = [SimpleNamespace(topic=key[0], index=key[1], masks=own) for key, own in masks]
+    tables = {
+        "frames": pa.Table.from_pylist(frames, FRAMES),
+        "masks": arrow_table(mask_columns(perceived), MASKS),
+    }
+    for name, table in tables.items():
+        pq.write_table(table, folder / f"{name}.parquet", row_group_size=32)
 
 
-def test_image_has_masks_of_the_frame_nearest_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_image_has_masks_of_the_frame_nearest_in_time(tmp_path: Path) -> None:
     """Several frames may share an image: its boxes were those of the first, half a period early."""
     stamps = [20, 40, 55, 90, 150, 160]
     masks = [
         (("/d", k), ImageMasks("/l", image, image + 60, "c", 40, 30, {}, {}))  # logged late
         for k, image in enumerate([50, 50, 50, 150, 150, 150])
     ]
-    patch_masks(monkeypatch, masks, stamps)
+    write_masks(tmp_path, masks, stamps)
 
-    found = [(key, image.stamp_ns) for key, image in read_nearest_masks(Path())]
+    found = [(key, image.stamp_ns) for key, image in read_nearest_masks(tmp_path)]
     assert found == [(("/d", 2), 50), (("/d", 4), 150)]
 
 
-def test_successive_images_with_equal_stamps_are_all_annotated(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_successive_images_with_equal_stamps_are_all_annotated(tmp_path: Path) -> None:
     """A clock that was set back by one period gives the next image the same stamp."""
     masks = [
         (("/d", k), ImageMasks("/l", 50, logged, "c", 40, 30, {}, {}))
         for k, logged in enumerate([60, 60, 160])
     ]
-    patch_masks(monkeypatch, masks, [50, 50, 50])
+    write_masks(tmp_path, masks, [50, 50, 50])
 
-    found = [(key, image.log_time_ns) for key, image in read_nearest_masks(Path())]
+    found = [(key, image.log_time_ns) for key, image in read_nearest_masks(tmp_path)]
     assert found == [(("/d", 0), 60), (("/d", 2), 160)]
 
 
 @pytest.mark.parametrize("every", [1, 3])
 @pytest.mark.parametrize("late", [0, 1, 100])
 def test_image_of_two_sensors_is_annotated_once_if_one_is_late(
-    late: int, every: int, monkeypatch: pytest.MonkeyPatch
+    late: int, every: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Boxes would flicker: those of one sensor, then of the other, in messages out of order.
 
@@ -280,14 +286,19 @@ def test_image_of_two_sensors_is_annotated_once_if_one_is_late(
         ((topic, k), ImageMasks("/rgb", 10 * k, 10 * k + 5, "c", 40, 30, {}, {}))
         for topic, k, _ in frames
     ]
-    unread: Any = iter(masks)
-    patch_masks(monkeypatch, masks, [stamp for *_, stamp in frames])
-    monkeypatch.setattr("shapecat.runs.tables.masks.read_masks", lambda _folder, **_: unread)
+    write_masks(tmp_path, masks, [stamp for *_, stamp in frames])
+    taken: set[int] = set()
+
+    def count_taken(table: pa.Table) -> Iterator[tuple[Key, ImageMasks]]:
+        for key, image in masks_in(table):
+            taken.add(image.stamp_ns)
+            yield key, image
+
+    monkeypatch.setattr("shapecat.runs.tables.masks.masks_in", count_taken)
     found, waiting = [], []
-    for (topic, _), image in read_nearest_masks(Path()):
+    for (topic, _), image in read_nearest_masks(tmp_path):
         found.append((topic, image.stamp_ns // 10))
-        number_read = len(masks) - unread.__length_hint__()
-        waiting.append(len({one.stamp_ns for _, one in masks[:number_read]}) - len(found))
+        waiting.append(len(taken) - len(found))
 
     nearer = range(400 - late)
     kept = [k for k in range(600) if k in nearer or k % every == 0]
@@ -295,18 +306,16 @@ def test_image_of_two_sensors_is_annotated_once_if_one_is_late(
     assert max(waiting) <= 256  # memory does not grow with the length
 
 
-def test_simultaneous_images_of_two_cameras_are_annotated(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_simultaneous_images_of_two_cameras_are_annotated(tmp_path: Path) -> None:
     """Images of two cameras may have equal stamps. An image of two depth streams counts once."""
     images = [("/l", 5, 30), ("/r", 5, 30)] * 2 + [("/r", 9, 30), ("/cloud", 11, 1)]
     masks = [
         (("/d", k), ImageMasks(topic, stamp, stamp + 1, "c", 40, height, {0: (3, 4, 7, 9)}, {}))
         for k, (topic, stamp, height) in enumerate(images)
     ]
-    patch_masks(monkeypatch, masks, [5] * len(masks))
+    write_masks(tmp_path, masks, [5] * len(masks))
     tracks: Any = SimpleNamespace(objects=lambda _key: {TrackLabel(6, "cup", 0.8): {0: 0}})
-    frames = list(read_image_frames(Path(), tracks))
+    frames = list(read_image_frames(tmp_path, tracks))
 
     assert [frame.stamp_ns for frame in frames] == [5, 5, 9]
     assert {frame.boxes for frame in frames} == {(ImageBox(6, "cup", 0.8, (3, 4, 7, 9)),)}

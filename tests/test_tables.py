@@ -32,7 +32,7 @@ from shapecat.runs.run_info import (
     OriginInfo,
     RunInfo,
 )
-from shapecat.runs.tables.masks import mask_columns, read_masks, read_nearest_masks
+from shapecat.runs.tables.masks import mask_columns, read_nearest_masks
 from shapecat.runs.tables.reading import (
     keys_of,
     opened,
@@ -55,7 +55,7 @@ from shapecat.types import (
     Pose,
     Scene,
 )
-from tests.track_tables import write_tracks
+from tests.track_tables import read_masks, write_tracks
 
 CATEGORIES = ("cup", "can")
 

@@ -8,10 +8,13 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from shapecat.runs.tables.masks import masks_in
+from shapecat.runs.tables.reading import Key
 from shapecat.runs.tables.schemas import TRACKS
 from shapecat.runs.tables.writing import write_table
+from shapecat.types import ImageMasks
 
-__all__ = ["lines", "rows", "untimed_table", "write_tracks"]
+__all__ = ["lines", "read_masks", "rows", "untimed_table", "write_tracks"]
 
 
 def write_tracks(
@@ -42,6 +45,11 @@ def rows(folder: Path, table: str, *columns: str) -> list[dict[str, Any]]:
     """Return the rows of a table of a run, with all columns unless some are named."""
     found = pq.read_table(folder / f"{table}.parquet", columns=list(columns) or None)
     return list(found.to_pylist())
+
+
+def read_masks(folder: Path) -> list[tuple[Key, ImageMasks]]:
+    """Return each frame of a run that has a colour image, and its masks."""
+    return list(masks_in(pq.read_table(folder / "masks.parquet")))
 
 
 def lines(folder: Path) -> list[dict[str, str]]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,11 @@ from shapecat.arrays import F4
 from shapecat.geometry import box_around
 from shapecat.runs.labelled_tracks import LabelledTracks
 from shapecat.runs.labels.meaning import TrackLabel
-from shapecat.runs.tables.masks import read_masks
-from shapecat.runs.tables.reading import Key, misfit, numbers, read_together
+from shapecat.runs.tables.masks import masks_in
+from shapecat.runs.tables.reading import misfit, numbers, read_together
 from shapecat.system.memory import release_memory
 from shapecat.types import (
     Box,
-    ImageMasks,
     LabelledFrame,
     LabelledObject,
     NeuralGas,
@@ -58,11 +58,14 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
     """
     tracks = LabelledTracks.read(folder, labels, causal=True)
     release_memory()  # of the table of tracks
-    masks, ended = _MasksByFrame(read_masks(folder)), tracks.endings()
+    ended = tracks.endings()
     tables = {"frames": None, "detections": _OBJECT, "planes": None}
-    for frames, detections, planes in read_together(folder, tables):
+    if (folder / "masks.parquet").exists():
+        tables["masks"] = None
+    for frames, detections, planes, *masks in read_together(folder, tables):
         objects = rows_by_frame(detections)
         supports = rows_by_frame(planes)
+        masks_of = dict(chain.from_iterable(map(masks_in, masks)))
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])
             detected_rows = {row["detection"]: row for row in objects.get(key, [])}
@@ -70,29 +73,9 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
                 raise misfit(folder)
             planes_of_frame = supports.get(key, [])
             frame = _labelled_frame(row, detected_rows, planes_of_frame, tracks, ended(key))
-            yield replace(frame, masks=masks.of(key))
-    if masks.has_more:
-        raise misfit(folder)
-
-
-class _MasksByFrame:
-    """The masks of the frames, which must be requested in the order of the table."""
-
-    def __init__(self, rows: Iterator[tuple[Key, ImageMasks]]) -> None:
-        self._rows = rows
-        self._next = next(rows, None)
-
-    def of(self, key: Key) -> ImageMasks | None:
-        """Return the masks of a frame; None if it has none."""
-        if self._next is None or self._next[0] != key:
-            return None
-        row, self._next = self._next[1], next(self._rows, None)
-        return row
-
-    @property
-    def has_more(self) -> bool:
-        """Whether masks are left: their frames were not requested, or not in the table's order."""
-        return self._next is not None
+            yield replace(frame, masks=masks_of.pop(key, None))
+        if masks_of:  # of frames that are not in the frames table
+            raise misfit(folder)
 
 
 def rows_by_frame(table: pa.Table) -> dict[tuple[str, int], list[dict[str, Any]]]:

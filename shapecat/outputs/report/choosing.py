@@ -3,17 +3,17 @@
 Both are chosen from the tables alone, before the recording is opened.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from shapecat.outputs.report.tracks import Detected, Timeline
-from shapecat.runs.tables.masks import read_masks
-from shapecat.runs.tables.reading import Key, read_row_groups, read_stamps
+from shapecat.runs.tables.masks import masks_in
+from shapecat.runs.tables.reading import Key, read_stamps, read_together
 from shapecat.types import ImageMasks
 
 __all__ = ["Choice", "choose_frames"]
@@ -76,22 +76,25 @@ def _views(folder: Path, owner: Mapping[Detected, int]) -> dict[int, list[_View]
     ``owner`` is the track of each detection.
     """
     columns = ["topic", "frame", "detection", "points", "touches_border", "occluded"]
-    masks = _areas(read_masks(folder))
+    tables: dict[str, list[str] | None] = {"detections": columns}
+    if (folder / "masks.parquet").exists():
+        tables["masks"] = None
     views: dict[int, list[_View]] = {}
-    for group in read_row_groups(folder / "detections.parquet", columns):
-        cells = (group[name].to_pylist() for name in columns)
+    for detections, *masks in read_together(folder, tables):
+        areas = _areas(chain.from_iterable(map(masks_in, masks)))
+        cells = (detections[name].to_pylist() for name in columns)
         for topic, frame, detection, points, border, occluded in zip(*cells, strict=True):
             key = (topic, frame, detection)
             if key not in owner:
                 continue
-            area, cut = masks.get(key, (_COLOURLESS * points, False))
+            area, cut = areas.get(key, (_COLOURLESS * points, False))
             complete = not (border or occluded or cut)
             view = _View((topic, frame), area * (1.0 if complete else _PARTIAL), complete)
             views.setdefault(owner[key], []).append(view)
     return views
 
 
-def _areas(masks: Iterator[tuple[Key, ImageMasks]]) -> dict[Detected, tuple[float, bool]]:
+def _areas(masks: Iterable[tuple[Key, ImageMasks]]) -> dict[Detected, tuple[float, bool]]:
     """Return the area of each mask in pixels, and whether it touches the image border."""
     areas = {}
     for key, frame in masks:

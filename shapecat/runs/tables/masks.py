@@ -9,12 +9,13 @@ import numpy as np
 import pyarrow as pa
 
 from shapecat.arrays import U4
-from shapecat.runs.tables.reading import Key, misfit, numbers, read_row_groups, read_stamps
+from shapecat.runs.tables.reading import Key, keys_of, misfit, numbers, read_together
 from shapecat.runs.tables.schemas import MASKS
 from shapecat.types import ImageMasks, Perception
 
-__all__ = ["mask_columns", "read_masks", "read_nearest_masks"]
+__all__ = ["mask_columns", "masks_in", "read_nearest_masks"]
 
+_WITHOUT_COUNTS = MASKS.names[:-1]
 _HELD = 256
 """Maximum number of images held back, since a later frame may be nearer to them in time."""
 
@@ -37,25 +38,20 @@ def mask_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
     }
 
 
-def read_masks(folder: Path, *, boxes_only: bool = False) -> Iterator[tuple[Key, ImageMasks]]:
-    """Yield each frame that has a colour image, and its masks, in the order of the frames table.
+def masks_in(table: pa.Table) -> Iterator[tuple[Key, ImageMasks]]:
+    """Yield each frame in a part of the table of masks, and its masks.
 
-    With ``boxes_only``, the masks lack run lengths, which make up most of the table.
+    The masks lack run lengths if the part lacks the column ``counts``, which is most of the table.
     """
-    path = folder / "masks.parquet"
-    if not path.exists():
-        return
-    plain = MASKS.names[: -1 if boxes_only else None]
-    for group in read_row_groups(path, plain):
-        counts = None if boxes_only else _run_lengths(group["counts"])
-        for row in group.select(MASKS.names[:-1]).to_pylist():
-            detections = row.pop("detection")
-            boxes = np.reshape(row.pop("box"), (-1, 4)).astype(int).tolist()
-            key = row.pop("topic"), row.pop("frame")
-            of_image = {name.removeprefix("color_"): value for name, value in row.items()}
-            runs = {} if counts is None else {n: next(counts) for n in detections}
-            named = dict(zip(detections, map(tuple, boxes), strict=True))
-            yield key, ImageMasks(**of_image, boxes=named, counts=runs)
+    counts = _run_lengths(table["counts"]) if "counts" in table.column_names else None
+    for row in table.select(_WITHOUT_COUNTS).to_pylist():
+        detections = row.pop("detection")
+        boxes = np.reshape(row.pop("box"), (-1, 4)).astype(int).tolist()
+        key = row.pop("topic"), row.pop("frame")
+        of_image = {name.removeprefix("color_"): value for name, value in row.items()}
+        runs = {} if counts is None else {n: next(counts) for n in detections}
+        named = dict(zip(detections, map(tuple, boxes), strict=True))
+        yield key, ImageMasks(**of_image, boxes=named, counts=runs)
 
 
 def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
@@ -69,19 +65,22 @@ def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
     ------
     OutputError : a table is unreadable, or a frame with masks is not in the frames table.
     """
+    if not (folder / "masks.parquet").exists():
+        return
     held: dict[tuple[int, int, str], tuple[int, Key, ImageMasks]] = {}
-    stamps = read_stamps(folder)
-    for key, masks in read_masks(folder, boxes_only=True):
-        stamp = next((stamp for candidate, stamp in stamps if candidate == key), None)
-        if stamp is None:
-            raise misfit(folder)
-        apart = abs(stamp - masks.stamp_ns)
-        # Stamps alone repeat after a clock was set back.
-        image = masks.log_time_ns, masks.stamp_ns, masks.topic
-        if image not in held or apart < held[image][0]:
-            held[image] = apart, key, masks
-        if len(held) > _HELD:
-            yield held.pop(min(held))[1:]
+    columns = {"frames": ("topic", "frame", "stamp_ns"), "masks": _WITHOUT_COUNTS}
+    for frames, table in read_together(folder, columns):
+        stamps = dict(zip(keys_of(frames), numbers(frames["stamp_ns"]).tolist(), strict=True))
+        for key, masks in masks_in(table):
+            if key not in stamps:
+                raise misfit(folder)
+            apart = abs(stamps[key] - masks.stamp_ns)
+            # Stamps alone repeat after a clock was set back.
+            image = masks.log_time_ns, masks.stamp_ns, masks.topic
+            if image not in held or apart < held[image][0]:
+                held[image] = apart, key, masks
+            if len(held) > _HELD:
+                yield held.pop(min(held))[1:]
     yield from (held[image][1:] for image in sorted(held))
 
 
