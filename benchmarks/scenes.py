@@ -1,7 +1,6 @@
 """Frames for the benchmarks: simulated scenes and, if available, real tables."""
 
 import json
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,7 +60,7 @@ def real_tables(every: int = 1) -> Iterator[Frame]:
     if path.exists():
         with open_recording(path) as recording:
             streams = choose_streams(recording, ())
-            yield from frames(recording, streams, FrameRange(every=every), skipped=Counter())
+            yield from frames(recording, streams, FrameRange(every=every))
 
 
 def labelled_clutter(count: int, first_seed: int = 500) -> Iterator[Labelled]:

@@ -5,7 +5,6 @@
 
 import difflib
 import os
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -95,7 +94,7 @@ class OpenRecording:
         frame_range = FrameRange(start_s, end_s, every)
         chosen = (topics,) if isinstance(topics, str) else tuple(topics)
         streams = choose_streams(self.recording, chosen)
-        return frames(self.recording, streams, frame_range, skipped=Counter())
+        return frames(self.recording, streams, frame_range)
 
 
 def open_recording(path: str | Path) -> OpenRecording:

@@ -1,6 +1,5 @@
 """Tests of calibrations, poses and views that change in a recording or differ between topics."""
 
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -98,7 +97,7 @@ def read_both(path: Path, wanted: str | None = None) -> Pairs:
     with open_recording(path) as recording:
         streams = choose_streams(recording, TOPICS)
         colours = pair_colours(recording, streams, wanted)
-        return list(frames_with_colour(recording, streams, colours, skipped=Counter()))
+        return list(frames_with_colour(recording, streams, colours))
 
 
 def test_new_calibration_applies_to_both_streams_of_camera(tmp_path: Path) -> None:
@@ -128,7 +127,7 @@ def test_rays_follow_new_focal_lengths(tmp_path: Path, bend: Any) -> None:
             items.append(("/depth/camera_info", k, info(EPOCH + k, camera, bend)))
             items.append(("/depth/image", k, image(EPOCH + k, wavy_depth())))
         with open_recording(write(tmp_path / f"{len(cameras)}.mcap", items)) as recording:
-            return list(frames(recording, choose_streams(recording), skipped=Counter()))
+            return list(frames(recording, choose_streams(recording)))
 
     _, second = read_frames(CAMERA, ZOOMED)
     (alone,) = read_frames(ZOOMED)

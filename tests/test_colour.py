@@ -1,7 +1,6 @@
 """Tests of masks on colour images: position, density, and visibility from the colour camera."""
 
 import itertools
-from collections import Counter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -532,7 +531,7 @@ def overlaps(path: Path) -> list[float]:
         colour = pair_colours(recording, [stream]).get(stream.topic)
         assert colour is not None
         colours = {stream.topic: colour}
-        for frame, view in frames_with_colour(recording, [stream], colours, skipped=Counter()):
+        for frame, view in frames_with_colour(recording, [stream], colours):
             assert view is not None
             own, other = labels[frame.index].ravel(), truth[frame.index]
             ids = [int(i) for i in np.unique(own) if i >= 20 and (own == i).sum() >= 100]

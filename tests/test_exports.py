@@ -3,7 +3,6 @@
 import csv
 import json
 import shutil
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -253,7 +252,7 @@ def test_kitti_refuses_categories_with_the_same_type(
 def intrinsics(run: Path) -> np.ndarray:
     finished = read_finished(run)
     with open_source(finished.info) as recording:
-        camera = next(read_frames(recording, finished.info["options"], skipped=Counter()))[0].camera
+        camera = next(read_frames(recording, finished.info["options"]))[0].camera
     assert camera is not None
     return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
 

@@ -2,7 +2,6 @@
 
 import io
 import json
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -57,7 +56,7 @@ def read(
         streams = choose_streams(recording, topics)
         colours = pair_colours(recording, streams, wanted)
         chosen = FrameRange(**frame_range)
-        pairs = frames_with_colour(recording, streams, colours, chosen, skipped=Counter())
+        pairs = frames_with_colour(recording, streams, colours, chosen)
         return list(pairs), recording.warnings
 
 

@@ -317,7 +317,7 @@ def test_depth_may_be_a_png_file(tmp_path: Path, topic: str, kind: str, *, known
 
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         streams = depth_streams(recording)
-        found = list(frames(recording, streams, skipped=Counter()))
+        found = list(frames(recording, streams))
 
     assert len(found) == known
     for frame in found:

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ def test_neurons_lie_on_points_of_their_object(guessed_run: Path) -> None:
     found = rows(guessed_run, "detections")
     count = 0
     with open_source(run) as recording:
-        for frame, _ in read_frames(recording, run["options"], skipped=Counter()):
+        for frame, _ in read_frames(recording, run["options"]):
             for row in (row for row in found if row["frame"] == frame.index):
                 points = frame.xyz(np.array(row["indices"], np.uint32))
                 points = points[np.isfinite(points).all(axis=1)]

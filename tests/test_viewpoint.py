@@ -1,6 +1,5 @@
 """Tests of organized clouds that were transformed before they were recorded."""
 
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -231,7 +230,7 @@ def test_colour_camera_is_placed_beside_the_camera_of_a_moved_cloud(tmp_path: Pa
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         streams = choose_streams(recording)
         colours = pair_colours(recording, streams, None)
-        ((_, view),) = frames_with_colour(recording, streams, colours, skipped=Counter())
+        ((_, view),) = frames_with_colour(recording, streams, colours)
 
     assert view is not None
     assert view.colour_from_depth is not None
@@ -242,4 +241,4 @@ def test_colour_camera_is_placed_beside_the_camera_of_a_moved_cloud(tmp_path: Pa
 
 def read(path: Path) -> list[Frame]:
     with open_recording(path) as recording:
-        return list(frames(recording, choose_streams(recording), skipped=Counter()))
+        return list(frames(recording, choose_streams(recording)))

@@ -1,6 +1,6 @@
 """Pair labelled frames with their depth and colour images from the recording."""
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache, partial
@@ -59,7 +59,6 @@ def with_colour(
     read = read_frames(
         recording,
         run["options"],
-        skipped=Counter(),
         needed=awaited.needs,
         same_images=awaited.image_of,
     )

@@ -56,7 +56,7 @@ def frames_with_colour(
     colours: Mapping[str, ColourStream],
     frame_range: FrameRange = ALL_FRAMES,
     *,
-    skipped: Counter[str],
+    skipped: Counter[str] | None = None,
     needed: Needed = None,
     same_images: KnownImages = None,
 ) -> Iterator[tuple[Frame, ColourView | None]]:

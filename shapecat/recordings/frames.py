@@ -75,7 +75,7 @@ def frames(
     streams: Sequence[Stream],
     frame_range: FrameRange = ALL_FRAMES,
     *,
-    skipped: Counter[str],
+    skipped: Counter[str] | None = None,
     callbacks: Mapping[str, Callable[[Message], None]] | None = None,
     needed: Needed = None,
 ) -> Iterator[Frame]:
@@ -86,7 +86,7 @@ def frames(
 
     Parameters
     ----------
-    skipped : receives the number of unreadable frames by reason; they raise no error.
+    skipped : receives the number of unreadable frames by reason, which raise no error.
     callbacks : for some topics, a function to call with each message of the topic.
     needed : returns whether a frame, or a message for ``callbacks``, is needed, given its topic and
         log time (ns). Others may be left out if the recording has an index. None if all are needed.
@@ -95,6 +95,8 @@ def frames(
     ------
     Frames by log time. Their ``index`` counts the messages of their stream, from 0 at ``start_s``.
     """
+    if skipped is None:
+        skipped = Counter()
     sources: dict[str, FrameSource] = {
         stream.topic: SOURCES[stream.kind](recording, stream, skipped) for stream in streams
     }

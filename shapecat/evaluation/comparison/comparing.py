@@ -191,7 +191,7 @@ def _recorded_frames(
     try:
         source = stack.enter_context(open_source(finished.info, recording))
         options: Options = {**finished.info["options"], "color": ""}
-        return (frame for frame, _ in read_frames(source, options, skipped=Counter())), []
+        return (frame for frame, _ in read_frames(source, options)), []
     except (RecordingError, OutputError) as error:
         if recording is not None:
             raise

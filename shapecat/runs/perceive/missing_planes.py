@@ -1,6 +1,5 @@
 """Explain why most frames of a run have no supporting plane, and so no objects."""
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -42,7 +41,7 @@ def explain_missing_planes(recording: Recording, folder: Path, run: RunInfo) -> 
     frames, bare, first = _count(folder)
     if 2 * bare <= frames:
         return
-    pairs = read_frames(recording, run["options"], skipped=Counter())
+    pairs = read_frames(recording, run["options"])
     chosen = (frame for frame, _ in pairs if (frame.topic, frame.index) in first)
     seen = [(_distances(frame), _extent_m(frame)) for frame in islice(chosen, len(first))]
     distances = [each for each, _ in seen if each.size]

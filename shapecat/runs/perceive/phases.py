@@ -15,6 +15,7 @@ from shapecat.executors.ordered_pool import OrderedPool
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, PerceptionInput
 from shapecat.recordings import Recording, Stream
+from shapecat.recordings.colour_frames import frames_with_colour
 from shapecat.recordings.colour_motion import view_at_its_time
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.transforms.gravity import PoseFinder
@@ -23,7 +24,7 @@ from shapecat.runs.jobs import Job
 from shapecat.runs.perceive.clocks import explain_transform_clocks
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.perceive.second_look import Revision, frames_to_revise
-from shapecat.runs.perceive.selection import count_frames, read_frames
+from shapecat.runs.perceive.selection import count_frames
 from shapecat.runs.perceive.up_check import Oriented, UpCheck
 from shapecat.runs.perceive.up_report import report_up
 from shapecat.runs.run_info import RunInfo
@@ -213,12 +214,8 @@ def _placed(poses: PoseFinder, frame: Frame, colour: ColourView | None) -> Orien
 
 def _readings(work: Work, skipped: Counter[str]) -> Iterator[tuple[Frame, ColourView | None]]:
     """Yield the frames of a run, with their colour images or None."""
-    for frame, colour in read_frames(
-        work.recording,
-        work.run["options"],
-        skipped=skipped,
-        streams=work.streams,
-        colours=work.colours,
+    for frame, colour in frames_with_colour(
+        work.recording, work.streams, work.colours, work.job.frame_range, skipped=skipped
     ):
         # Masks need no pixels, and frames are sent to other processes.
         yield frame, colour and replace(colour, image=replace(colour.image, data=b""))
