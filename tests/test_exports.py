@@ -25,7 +25,7 @@ from shapecat.runs.finished import open_source, read_finished
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.labels.corrections import adopt_labels
 from shapecat.runs.labels.track_table import read_track_table
-from shapecat.runs.perceive.selection import read_frames
+from shapecat.runs.selection import read_frames
 from tests.kitti_files import read_calibration, read_labels
 from tests.track_tables import rows
 

@@ -28,7 +28,7 @@ from shapecat.recordings.decoding.pointcloud2 import cloud_points
 from shapecat.recordings.messages import Message, Needed
 from shapecat.recordings.pinhole import fit_pinhole, still_fits
 from shapecat.recordings.sources import DepthSource
-from shapecat.runs.perceive.selection import count_frames
+from shapecat.runs.selection import count_frames
 from shapecat.types import Camera, Frame
 from tests.depth_encodings import png, rvl
 from tests.mcap_files import mcap_writer

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from shapecat.pipeline import annotate_again
 from shapecat.runs.finished import open_source
 from shapecat.runs.folder import read_run
-from shapecat.runs.perceive.selection import read_frames
+from shapecat.runs.selection import read_frames
 from tests.track_tables import lines, rows
 
 

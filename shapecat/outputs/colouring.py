@@ -13,8 +13,8 @@ from shapecat.errors import OutputError
 from shapecat.recordings import Recording
 from shapecat.recordings.colour_motion import view_at_its_time
 from shapecat.recordings.transforms.window import TransformWindow
-from shapecat.runs.perceive.selection import read_frames
 from shapecat.runs.run_info import RunInfo
+from shapecat.runs.selection import read_frames
 from shapecat.types import Frame, LabelledFrame
 
 __all__ = ["Coloured", "PairedFrame", "with_colour"]

@@ -34,8 +34,8 @@ from shapecat.evaluation.comparison.references import (
 )
 from shapecat.outputs.counts import plural
 from shapecat.runs.finished import FinishedRun, open_source
-from shapecat.runs.perceive.selection import read_frames
 from shapecat.runs.run_info import Options
+from shapecat.runs.selection import read_frames
 from shapecat.runs.tables.reading import Key
 from shapecat.system.progress import Observer, ignore, observed
 from shapecat.types import UNKNOWN, Frame

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapecat.runs.perceive.misplacement import (
+from shapecat.runs.perceive.centers import (
     APART_S,
     CENTERS,
     GAP_S,

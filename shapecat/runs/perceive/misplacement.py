@@ -2,36 +2,21 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-import pyarrow as pa
 
-from shapecat.arrays import F8
-from shapecat.runs.tables.reading import (
-    Key,
-    frame_rows,
-    keys_of,
-    numbers,
-    numbers_or_nan,
-    read_by_topic,
-    read_together,
+from shapecat.runs.perceive.centers import (
+    APART_S,
+    CENTERS,
+    GAP_S,
+    Centers,
+    centers_of,
+    moved_m,
 )
+from shapecat.runs.tables.reading import read_by_topic, read_together
 
-__all__ = [
-    "APART_S",
-    "CENTERS",
-    "GAP_S",
-    "Centers",
-    "centers_of",
-    "explain_misplacement",
-    "moved_m",
-]
+__all__ = ["explain_misplacement"]
 
-APART_S = 0.3
-"""Minimum time between two compared frames, so that even a slow camera has moved."""
-GAP_S = 2.0
-"""Maximum time between two compared frames, so that they show the same objects."""
 _MOVED_M = 0.03
 """The camera has moved if objects have moved farther than this relative to it."""
 _WORSE = 1.5
@@ -41,20 +26,6 @@ _MIN_MOTIONS = 5
 """Minimum number of comparisons on which a warning is based."""
 _WORSE_SHARE = 0.7
 """Minimum fraction of the comparisons in which poses are worse than none."""
-_FRAME = ("topic", "frame")
-CENTERS = {"frames": (*_FRAME, "stamp_ns"), "detections": (*_FRAME, "center", "center_fixed")}
-"""The tables and columns that `centers_of` needs."""
-
-
-class Centers(NamedTuple):
-    """The centres (n, 3) of a frame's objects, metres, in the sensor frame and the fixed frame.
-
-    ``fixed`` is NaN if the pose of the sensor is unknown.
-    """
-
-    stamp_ns: int
-    sensor: F8
-    fixed: F8
 
 
 def explain_misplacement(folder: Path, fixed_frame: str) -> Iterator[str]:
@@ -98,18 +69,3 @@ def _compare(folder: Path) -> dict[str, list[bool]]:
                 farther = moved_m(previous.fixed, centers.fixed) > _WORSE * moved
                 worse.setdefault(key[0], []).append(farther)
     return worse
-
-
-def centers_of(frames: pa.Table, detections: pa.Table) -> Iterator[tuple[Key, Centers]]:
-    """Yield each frame in a part of the tables, and the centres of its objects."""
-    rows = frame_rows(detections)
-    in_sensor, in_fixed = (numbers_or_nan(detections[name]) for name in ("center", "center_fixed"))
-    for key, stamp in zip(keys_of(frames), numbers(frames["stamp_ns"]).tolist(), strict=True):
-        span = rows.get(key, slice(0, 0))
-        yield key, Centers(stamp, in_sensor[span], in_fixed[span])
-
-
-def moved_m(previous: F8, current: F8) -> float:
-    """Return the median distance of objects (n, 3) to the nearest previous ones (m, 3), metres."""
-    distances = np.linalg.norm(current[:, None] - previous, axis=2)
-    return float(np.median(distances.min(axis=1)))

@@ -8,8 +8,8 @@ import numpy as np
 
 from shapecat.arrays import F4
 from shapecat.recordings import Recording
-from shapecat.runs.perceive.selection import read_frames
 from shapecat.runs.run_info import RunInfo
+from shapecat.runs.selection import read_frames
 from shapecat.runs.tables.reading import Key, keys_of, read_together
 from shapecat.types import Frame
 

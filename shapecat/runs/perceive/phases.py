@@ -24,10 +24,10 @@ from shapecat.runs.jobs import Job
 from shapecat.runs.perceive.clocks import explain_transform_clocks
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.perceive.second_look import Revision, frames_to_revise
-from shapecat.runs.perceive.selection import count_frames
 from shapecat.runs.perceive.up_check import Oriented, UpCheck
 from shapecat.runs.perceive.up_report import report_up
 from shapecat.runs.run_info import RunInfo
+from shapecat.runs.selection import count_frames
 from shapecat.runs.tables.reading import Key, count_rows, read_row_groups
 from shapecat.runs.tables.segments import read_segments
 from shapecat.system import stopping
