@@ -25,7 +25,7 @@ from shapecat.recordings.transforms.window import TransformWindow
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceive import up_check
-from shapecat.runs.perceive.up_report import report_up
+from shapecat.runs.perceive.up_report import explain_up, report_up
 from shapecat.runs.tables.schemas import DETECTIONS, FRAMES, PLANES
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Frame, Pose
@@ -511,9 +511,9 @@ def test_transforms_with_the_stamps_of_others_are_reported(
         poses = PoseFinder.of(recording, up="auto", fixed_frame=None)
         for k in range(len(items)):
             poses.orient(replace(frame(EPOCH + times[k][0]), log_time_ns=EPOCH + k * SECOND))
-    report_up(poses, tmp_path)
+    warnings = explain_up(poses, tmp_path, {})
 
-    found = [text for text in poses.warnings if "a clock was set back, and those of camera" in text]
+    found = [text for text in warnings if "a clock was set back, and those of camera" in text]
     assert len(found) == warned
 
 
@@ -523,9 +523,8 @@ def test_failed_transform_look_ups_are_counted(tmp_path: Path) -> None:
         poses = PoseFinder.of(recording, up="auto", fixed_frame=None)
     for stamp in (EPOCH, EPOCH + 1):
         assert poses.orient(frame(stamp)).up is None
-    report_up(poses, tmp_path)
 
-    (warning,) = poses.warnings
+    (warning,) = explain_up(poses, tmp_path, {})
     assert warning.startswith("failed transform look-ups: 2, the first: ")
 
 
@@ -548,9 +547,9 @@ def test_frames_without_pose_are_reported_with_what_they_cost(
     poses = PoseFinder(TransformWindow(TransformBuffer()), "map", None, ("tf",))
     poses.failed = begins
 
-    report_up(poses, tmp_path)
+    warnings = list(explain_up(poses, tmp_path, {}))
 
-    assert poses.warnings[1:] == [f"/d: the pose of its sensor in map is {loss}"]
+    assert warnings[1:] == [f"/d: the pose of its sensor in map is {loss}"]
 
 
 @pytest.mark.parametrize(

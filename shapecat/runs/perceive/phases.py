@@ -25,7 +25,7 @@ from shapecat.runs.perceive.clocks import explain_transform_clocks
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
 from shapecat.runs.perceive.second_look import Revision, frames_to_revise
 from shapecat.runs.perceive.up_check import Oriented, UpCheck
-from shapecat.runs.perceive.up_report import report_up
+from shapecat.runs.perceive.up_report import explain_up, report_up
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.selection import count_frames
 from shapecat.runs.tables.reading import Key, count_rows, read_row_groups
@@ -91,15 +91,21 @@ def perceive_all(work: Work) -> None:
     if resumed:
         run["counts"]["resumed"] = resumed
     run["fixed_frame"], run["up"] = poses.fixed_frame, report_up(poses, folder)
-    if poses.fixed_frame is not None:
-        frame_ids = {stream.topic: stream.frame_id for stream in work.streams}
-        poses.warnings += explain_transform_clocks(
-            folder, poses.transforms, poses.fixed_frame, frame_ids
-        )
     lost = [f"skipped frames ({n}×): {reason}" for reason, n in skipped.most_common(3)]
-    run["warnings"] = [*lost, *recording.warnings, *poses.warnings, *recent.warnings()]
+    of_poses = [*poses.warnings, *_explain_poses(work, poses)]
+    run["warnings"] = [*lost, *recording.warnings, *of_poses, *recent.warnings()]
     if recording.damaged:
         run["damaged"] = True
+
+
+def _explain_poses(work: Work, poses: PoseFinder) -> Iterator[str]:
+    """Yield a warning for each problem with the up directions and poses of the perceived frames."""
+    yield from explain_up(poses, work.folder, work.run["up"])
+    if poses.fixed_frame is not None:
+        frame_ids = {stream.topic: stream.frame_id for stream in work.streams}
+        yield from explain_transform_clocks(
+            work.folder, poses.transforms, poses.fixed_frame, frame_ids
+        )
 
 
 def revise(work: Work) -> None:

@@ -1,6 +1,6 @@
-"""Report the source of a run's up direction, and its agreement with the planes."""
+"""Report the source of a run's up direction; warn if it, or a pose, may be wrong or unknown."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from shapecat.recordings.transforms.gravity import PoseFinder
 from shapecat.runs.tables.placed_frames import count_poses
 from shapecat.runs.tables.reading import keys_of, read_together
 
-__all__ = ["report_up"]
+__all__ = ["explain_up", "report_up"]
 
 _DISAGREE_DEG = 10
 
@@ -19,31 +19,10 @@ _DISAGREE_DEG = 10
 def report_up(poses: PoseFinder, folder: Path) -> dict[str, Any]:
     """Return the source of the up direction and its agreement with the planes, for run.json.
 
-    Failed look-ups, gaps, contradictions, their consequences, and large differences are added to
-    the warnings of ``poses``.
-
     Parameters
     ----------
     folder : folder with the tables of frames, planes and detections.
     """
-    if poses.failed:
-        poses.warnings.append(
-            f"failed transform look-ups: {poses.failed}, the first: {poses.first_failure}"
-        )
-    if poses.longest_gap is not None:
-        gap = poses.longest_gap
-        poses.warnings.append(
-            f"frames without pose ({poses.in_gaps}×): gaps of up to {gap.gap_s:.2f} s in the "
-            f"transforms of {gap.frame_id}, which moves meanwhile"
-        )
-    if poses.transforms.contradicted:
-        frames = listed(poses.transforms.contradicted)
-        poses.warnings.append(
-            f"transforms: a clock was set back, and those of {frames} have the stamps of different "
-            "earlier ones: poses may be those of another time; split the recording where its "
-            "stamps go backwards"
-        )
-    poses.warnings += _missing_poses(folder, poses)
     uses = poses.given
     report: dict[str, Any] = {"source": max(uses, key=lambda name: uses[name], default="planes")}
     if poses.dropped:
@@ -54,12 +33,39 @@ def report_up(poses: PoseFinder, folder: Path) -> dict[str, Any]:
         angles, bare = _angles_to_planes(folder)
         typical = round(float(np.median(angles)), 1) if angles else None
         report |= {"planes_differ_deg": typical, "frames_without_plane": bare}
-        if typical is not None and typical > _DISAGREE_DEG:
-            poses.warnings.append(
-                f"up and the detected planes differ by {typical} degrees; try another --up "
-                "(tf, imu, or X,Y,Z)"
-            )
     return report
+
+
+def explain_up(poses: PoseFinder, folder: Path, report: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a warning for failed look-ups, gaps, contradictions, their consequences, and wrong up.
+
+    Parameters
+    ----------
+    folder : folder with the table of frames.
+    report : the result of `report_up`.
+    """
+    if poses.failed:
+        yield f"failed transform look-ups: {poses.failed}, the first: {poses.first_failure}"
+    if poses.longest_gap is not None:
+        gap = poses.longest_gap
+        yield (
+            f"frames without pose ({poses.in_gaps}×): gaps of up to {gap.gap_s:.2f} s in the "
+            f"transforms of {gap.frame_id}, which moves meanwhile"
+        )
+    if poses.transforms.contradicted:
+        frames = listed(poses.transforms.contradicted)
+        yield (
+            f"transforms: a clock was set back, and those of {frames} have the stamps of different "
+            "earlier ones: poses may be those of another time; split the recording where its "
+            "stamps go backwards"
+        )
+    yield from _missing_poses(folder, poses)
+    differ_deg = report.get("planes_differ_deg")
+    if differ_deg is not None and differ_deg > _DISAGREE_DEG:
+        yield (
+            f"up and the detected planes differ by {differ_deg} degrees; try another --up "
+            "(tf, imu, or X,Y,Z)"
+        )
 
 
 def _missing_poses(folder: Path, poses: PoseFinder) -> Iterator[str]:
