@@ -39,7 +39,7 @@ def require_resumable(job: Job, planned: RunInfo, digest: Callable[[], str]) -> 
     if job.overwrite or not has_work(folder):
         return
     try:
-        run = _with_outputs(read_run(folder), planned)
+        run = read_run(folder)
     except OutputError:  # nothing can continue it
         return
     differing, place = _perception_differences(run, planned), run["input"]["path"]
@@ -77,17 +77,17 @@ def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], st
     OutputError : the folder cannot be written.
     """
     with suppress(OutputError):
-        run = _with_outputs(read_run(folder), planned)
+        run = read_run(folder)
         if not _perception_differences(run, planned) and _same_recording_and_versions(
             run, planned, source, digest
         ):
             _require_complete(folder)
-            if differences(run, planned):
+            if _result_differences(run, planned):
                 run = _with_perceived(planned, run)
                 write_run(folder, run)
             elif "perceive" in run["seconds"]:
                 run["counts"]["resumed"] = run["counts"]["frames"]
-            return {**run, "input": planned["input"]}
+            return {**run, "input": planned["input"], "options": planned["options"]}
     clear(folder)
     write_run(folder, planned)
     return planned
@@ -116,8 +116,10 @@ def take_over_frames(
     OutputError : the folder cannot be written.
     """
     try:
-        run = _with_outputs(read_run(finished), planned)
-        later = bool(differences(run, planned)) and not _perception_differences(run, planned)
+        run = read_run(finished)
+        later = bool(_result_differences(run, planned)) and not _perception_differences(
+            run, planned
+        )
         alike = later and _same_recording_and_versions(run, planned, source, digest)
         if not (alike and _is_complete(finished, run)):
             return planned
@@ -139,8 +141,14 @@ def has_work(folder: Path) -> bool:
 
 def _perception_differences(run: RunInfo, planned: RunInfo) -> dict[str, str]:
     """Return the `differences` of two runs that affect the perceived frames."""
-    found = differences(run, planned).items()
+    found = _result_differences(run, planned).items()
     return {name: text for name, text in found if not name.startswith(_LATER)}
+
+
+def _result_differences(run: RunInfo, planned: RunInfo) -> dict[str, str]:
+    """Return the `differences` of two runs besides which outputs they have."""
+    found = differences(run, planned).items()
+    return {name: text for name, text in found if name not in OUTPUT_OPTIONS}
 
 
 def _with_perceived(planned: RunInfo, run: RunInfo) -> RunInfo:
@@ -168,13 +176,6 @@ def _require_complete(folder: Path) -> None:
     for table in TABLES:
         if (folder / f"{table}.parquet").exists():
             count_rows(folder, table)
-
-
-def _with_outputs(run: RunInfo, planned: RunInfo) -> RunInfo:
-    """Set the options for outputs in ``run`` to those in ``planned``; return ``run``."""
-    for name in OUTPUT_OPTIONS:
-        run["options"][name] = planned["options"][name]
-    return run
 
 
 def _same_recording_and_versions(
