@@ -134,7 +134,7 @@ def test_kept_transforms_do_not_grow_with_recording(tmp_path: Path) -> None:
         kept = []
         for second in range(SECONDS):
             lookup_at(window, second)
-            kept.append(len(window._known._tracks["base"].stamps))
+            kept.append(len(window.known._tracks["base"].stamps))
 
     assert max(kept) <= 5 * AROUND_NS // SECOND
     assert kept[-1] < SECONDS // 2

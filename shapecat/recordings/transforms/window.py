@@ -6,7 +6,6 @@ from copy import deepcopy
 from shapecat.recordings.look_ahead import AROUND_NS, LookAhead, reads_all_first
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.transforms.buffer import TransformBuffer
-from shapecat.recordings.transforms.delays import Delays
 from shapecat.recordings.transforms.reading import TransformReader, read_transforms
 from shapecat.recordings.transforms.topics import is_latched, transform_topics
 
@@ -23,6 +22,7 @@ class TransformWindow:
 
     Attributes
     ----------
+    known : the transforms read so far.
     tree : the static transforms, and the others from the start, the middle and the end of the
         recording: enough to know the names and parents of all frames.
     """
@@ -35,7 +35,7 @@ class TransformWindow:
     ) -> None:
         """Use ``buffer``, which holds all transforms, or is filled by ``ahead`` as needed."""
         self.tree = buffer if tree is None else tree
-        self._known, self._ahead = buffer, ahead
+        self.known, self._ahead = buffer, ahead
 
     @classmethod
     def of(cls, recording: Recording, sensor_topics: Sequence[str] = ()) -> "TransformWindow":
@@ -63,22 +63,8 @@ class TransformWindow:
         ahead.read_all()
         return cls(buffer)
 
-    @property
-    def moves(self) -> bool:
-        """Whether any frame moves in the transforms read so far."""
-        return self._known.moves
-
-    @property
-    def contradicted(self) -> list[str]:
-        """`TransformBuffer.contradicted` for the transforms read so far."""
-        return self._known.contradicted
-
-    def delays_between(self, target: str, source: str) -> list[Delays]:
-        """Return `TransformBuffer.delays_between` for the transforms read so far."""
-        return self._known.delays_between(target, source)
-
     def around(self, log_time_ns: int, stamp_ns: int) -> TransformBuffer:
         """Return the transforms for a frame, given its log time and stamp in nanoseconds."""
         if self._ahead is not None:
             self._ahead.advance(log_time_ns, stamp_ns)
-        return self._known
+        return self.known

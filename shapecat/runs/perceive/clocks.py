@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapecat.recordings.transforms.window import TransformWindow
+from shapecat.recordings.transforms.buffer import TransformBuffer
 from shapecat.runs.tables.reading import numbers, read_by_topic
 
 __all__ = ["explain_clocks", "explain_transform_clocks"]
@@ -42,7 +42,7 @@ def explain_clocks(folder: Path) -> Iterator[str]:
 
 
 def explain_transform_clocks(
-    folder: Path, transforms: TransformWindow, fixed_frame: str, frame_ids: Mapping[str, str]
+    folder: Path, transforms: TransformBuffer, fixed_frame: str, frame_ids: Mapping[str, str]
 ) -> Iterator[str]:
     """Yield a warning for each sensor whose clock is not that of the transforms that move it.
 

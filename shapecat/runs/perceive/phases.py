@@ -104,7 +104,7 @@ def _explain_poses(work: Work, poses: PoseFinder) -> Iterator[str]:
     if poses.fixed_frame is not None:
         frame_ids = {stream.topic: stream.frame_id for stream in work.streams}
         yield from explain_transform_clocks(
-            work.folder, poses.transforms, poses.fixed_frame, frame_ids
+            work.folder, poses.transforms.known, poses.fixed_frame, frame_ids
         )
 
 

@@ -52,8 +52,8 @@ def explain_up(poses: PoseFinder, folder: Path, report: Mapping[str, Any]) -> It
             f"frames without pose ({poses.in_gaps}×): gaps of up to {gap.gap_s:.2f} s in the "
             f"transforms of {gap.frame_id}, which moves meanwhile"
         )
-    if poses.transforms.contradicted:
-        frames = listed(poses.transforms.contradicted)
+    if contradicted := poses.transforms.known.contradicted:
+        frames = listed(contradicted)
         yield (
             f"transforms: a clock was set back, and those of {frames} have the stamps of different "
             "earlier ones: poses may be those of another time; split the recording where its "
@@ -74,7 +74,7 @@ def _missing_poses(folder: Path, poses: PoseFinder) -> Iterator[str]:
     Without a fixed frame, there is a warning if something moves, since it may be the sensor.
     """
     fixed_frame = poses.fixed_frame
-    if fixed_frame is None and poses.transforms.moves:
+    if fixed_frame is None and poses.transforms.known.moves:
         for topic in count_poses(folder):
             yield (
                 f"{topic}: no transforms lead from the frame of its sensor to a fixed frame: its "
