@@ -17,7 +17,8 @@ __all__ = ["FrameDetections", "frame", "gather", "track_frames"]
 class FrameDetections(Record):
     """The detections (n,) of one frame, which may have none; columns are as in `DetectionTable`.
 
-    There, ``detections`` are ``numbers``. If ``described`` is None, this frame described all.
+    There, ``detections`` are ``numbers``. If ``orientations`` is None, boxes are aligned with the
+    axes; if ``described`` is None, this frame described all.
     """
 
     topic: str
@@ -70,7 +71,7 @@ def gather(
         builder = TableBuilder(max(frame.posteriors.shape[1] for frame in stream))
         for frame in stream:
             own = np.full(len(frame.detections), frame.frame)
-            unknown = np.full((len(frame.detections), 4), np.nan)
+            aligned = np.broadcast_to((0, 0, 0, 1), (len(frame.detections), 4))
             builder.add(
                 [frame.topic],
                 frames=[frame.frame],
@@ -82,12 +83,10 @@ def gather(
                 posteriors=frame.posteriors,
                 partial=frame.partial,
                 novelties=frame.novelties,
-                orientations=unknown if frame.orientations is None else frame.orientations,
+                orientations=aligned if frame.orientations is None else frame.orientations,
                 described=own if frame.described is None else frame.described,
             )
-        table = builder.table()
-        known = table.orientations is not None and not np.isnan(table.orientations).any()
-        yield table if known else replace(table, orientations=None)
+        yield builder.table()
 
 
 def track_frames(

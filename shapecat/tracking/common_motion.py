@@ -39,14 +39,12 @@ class CommonMotion:
     def stabilised(self, table: DetectionTable) -> DetectionTable:
         """Return the detections transformed into the coordinate frame of the still objects."""
         centers = np.zeros(table.centers.shape)
-        orientations = None if table.orientations is None else np.zeros_like(table.orientations)
+        orientations = np.zeros_like(table.orientations)
         for block in table.blocks():
             turns = self.rotations[table.rows[block]]
             shifts = self.translations[table.rows[block]]
             centers[block] = np.einsum("nij,nj->ni", turns, table.centers[block]) + shifts
-            if orientations is not None:
-                turned = Rotation.from_matrix(turns @ table.axes(block))
-                orientations[block] = turned.as_quat()
+            orientations[block] = Rotation.from_matrix(turns @ table.axes(block)).as_quat()
         return replace(table, centers=centers, orientations=orientations)
 
     def unstabilised(self, rows: I4, places: F8) -> F8:
@@ -73,9 +71,8 @@ def find_common_motion(table: DetectionTable, tracks: Sequence[I4]) -> CommonMot
 
     Returns
     -------
-    The motion; None if the orientations are unknown, if fewer than three tracks have at least five
-    detections, if less than 70 % of their detections belong to moving objects, or if less than 70 %
-    fit a common motion.
+    The motion; None if fewer than three tracks have at least five detections, if less than 70 % of
+    their detections belong to moving objects, or if less than 70 % fit a common motion.
 
     Notes
     -----
@@ -84,7 +81,7 @@ def find_common_motion(table: DetectionTable, tracks: Sequence[I4]) -> CommonMot
     neighbouring frames. Outliers get less weight (Cauchy).
     """
     long = [track for track in tracks if len(track) >= _LONG]
-    if table.orientations is None or len(long) < 3:
+    if len(long) < 3:
         return None
     lengths = [len(track) for track in long]
     moved = [_extent(table.centers[track]) > _MOVED_M for track in long]

@@ -50,8 +50,7 @@ class DetectionTable:
     posteriors : (n, c) posteriors of the single views; each sums to 1.
     partial : (n,) whether the image border or an occluder cuts the object.
     novelties : (n,) novelties of the single views.
-    orientations : (n, 4) unit quaternions (x, y, z, w) of the boxes, in the frame of the centres;
-        None if they are unknown or no longer needed.
+    orientations : (n, 4) unit quaternions (x, y, z, w) of the boxes, in the frame of the centres.
     described : (n,) number of the frame from which the description of each detection was copied;
         that of its own frame if it was not copied.
     """
@@ -68,20 +67,18 @@ class DetectionTable:
     posteriors: F4
     partial: Bool
     novelties: F4
-    orientations: F4 | None
+    orientations: F4
     described: I4
 
     def without_boxes(self) -> Self:
         """Return the detections without sizes and orientations, which a `Track` does not need."""
-        return replace(self, sizes=np.zeros((0, 3), np.float32), orientations=None)
+        nothing = np.zeros((0, 4), np.float32)
+        return replace(self, sizes=nothing[:, :3], orientations=nothing)
 
     def axes(self, which: I4 | slice) -> F8:
-        """Return the axes (k, 3, 3) of the boxes of detections ``which``, as columns.
-
-        The result is empty if the orientations are not known.
-        """
-        quaternions = None if self.orientations is None else self.orientations[which]
-        if quaternions is None or len(quaternions) == 0:
+        """Return the axes (k, 3, 3) of the boxes of detections ``which``, as columns."""
+        quaternions = self.orientations[which]
+        if len(quaternions) == 0:
             return np.zeros((0, 3, 3))
         return np.asarray(Rotation.from_quat(quaternions).as_matrix())
 

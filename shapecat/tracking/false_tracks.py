@@ -18,11 +18,8 @@ def without_pieces(table: DetectionTable, tracks: Sequence[I4], max_gap_s: float
     If an object is split in some frames, the centre of a piece's track lies, in the other frames,
     in the box of the whole object. An object that only stands near another one, or is occluded by
     it, has its centre outside that box. ``tracks`` are the indices (k,) of the detections of each
-    track, ascending; gaps in a track that are longer than ``max_gap_s`` are not checked. Without
-    orientations, no track is removed.
+    track, ascending; gaps in a track that are longer than ``max_gap_s`` are not checked.
     """
-    if table.orientations is None:
-        return list(tracks)
     owner = table.track_of_each(tracks)
     covered = [
         _covered(table, track, max_gap_s) + _covered_beside(table, k, tracks, owner)

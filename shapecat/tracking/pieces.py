@@ -31,10 +31,9 @@ def join_pieces(table: DetectionTable, tracks: Sequence[I4]) -> list[I4]:
 
     Returns
     -------
-    The detections (k,) of each object, ascending, in the order of their first track; ``tracks`` if
-    the orientations are unknown.
+    The detections (k,) of each object, ascending, in the order of their first track.
     """
-    if table.orientations is None or len(tracks) < 2:
+    if len(tracks) < 2:
         return list(tracks)
     counts = _count_fits(table, tracks)
     root = np.arange(len(tracks))
