@@ -135,7 +135,7 @@ class DepthSource(FrameSource):
         self.info_topic = stream.info_topic or ""
         self.rectified = is_rectified(stream.topic)
         self.units = _depth_units(recording, stream.topic)
-        self._waiting: tuple[Message, int, Any] | None = None
+        self._waiting: tuple[Message, int, Any, int] | None = None  # the last is the stamp, ns
         self._info: Any = None
         self._info_stamp: int | None = None
 
@@ -156,7 +156,7 @@ class DepthSource(FrameSource):
         if self._waiting is None:
             self._info, self._info_stamp = info, stamp
             return
-        image_ns = stamp_ns(self._waiting[2].header)
+        *_, image_ns = self._waiting
         # A later calibration means that the image's own is missing: use the last one before it.
         if stamp <= image_ns or self._info is None:
             self._info, self._info_stamp = info, stamp
@@ -169,21 +169,16 @@ class DepthSource(FrameSource):
         yield from self.finish()
         with self.counting():
             image = self.recording.decode(message)
-            stamp_ns(image.header)
-            self._waiting = (message, index, image)
-        if self._awaited_ns is not None and self._awaited_ns == self._info_stamp:
-            yield from self.finish()
-
-    @property
-    def _awaited_ns(self) -> int | None:
-        """The stamp (ns) of the image that is held back; None if there is none."""
-        return None if self._waiting is None else stamp_ns(self._waiting[2].header)
+            image_ns = stamp_ns(image.header)
+            self._waiting = (message, index, image, image_ns)
+            if image_ns == self._info_stamp:
+                yield from self.finish()
 
     def finish(self) -> Iterator[Frame]:
         """Yield the frame of the image that is held back, with the best calibration so far."""
         if self._waiting is None:
             return
-        (message, index, image), self._waiting = self._waiting, None
+        (message, index, image, _), self._waiting = self._waiting, None
         with self.counting():
             yield self.frame(message, index, image.header, self._content(image))
 
