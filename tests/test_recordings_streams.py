@@ -352,13 +352,13 @@ def test_streams_are_compared_in_pairs_only(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(colour_streams, "colour_streams", lambda _: colours)
     monkeypatch.setattr(colour_streams, "depth_streams", lambda _: tuple(streams))
     compared = counting(monkeypatch, colour_streams, "_shared")
-    parsed = counting(monkeypatch, sensors, "_place")
+    parsed = counting(monkeypatch, sensors, "_split_topic")
 
     pairs = pair_colours(SimpleNamespace(topics=()), streams)  # type: ignore[arg-type]  # unread
 
     assert pairs == dict(zip([stream.topic for stream in streams], colours, strict=True))
     assert compared["_shared"] <= 3 * count**2
-    assert parsed["_place"] == count
+    assert parsed["_split_topic"] == count
 
 
 def test_colour_belongs_to_sensor_with_most_topic_parts_in_common() -> None:
