@@ -394,6 +394,25 @@ def test_masks_of_missing_frame_are_refused(tmp_path: Path) -> None:
             list(found)
 
 
+def test_masks_stay_with_their_frames_if_many_have_none(tmp_path: Path) -> None:
+    """Masks are read beside other tables: row groups without any must not shift later ones."""
+    masked = range(45, 100, 7)
+    options: Any = {"categories": CATEGORIES, "model_id": "m1", "colour": True}
+    with PerceptionTables(tmp_path, **options) as tables:
+        for k in range(100):
+            runs = np.array([k, 7, 1193 - k], np.uint32)
+            masks = ImageMasks("/rgb", 1000 + k, 2000, "c", 40, 30, {0: (3, 4, 7, 9)}, {0: runs})
+            found = replace(perception(k, 1), masks=masks if k in masked else None)
+            tables.write([found], [FrameRow(2000 + k, None)])
+    write_tracks(tmp_path, [(5, k, 0) for k in range(100)])
+
+    frames = list(read_labelled_frames(tmp_path, {5: TrackLabel(5, "cup", 0.7)}))
+    runs_of = {frame.index: frame.masks.counts[0][0] for frame in frames if frame.masks}
+    assert runs_of == {k: k for k in masked}
+    images = {masks.stamp_ns: key[1] for key, masks in read_nearest_masks(tmp_path)}
+    assert images == {1000 + k: k for k in masked}
+
+
 def test_rewritten_table_with_other_row_groups_is_refused(tmp_path: Path) -> None:
     """Data frame libraries write all rows as one group."""
     path = tmp_path / "detections.parquet"
