@@ -15,6 +15,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import rerun as rr
+from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from shapecat.cameras.colour import ColourImage, ColourView
@@ -532,6 +533,14 @@ def test_clouds_have_limited_points_and_category_colours() -> None:
     ratios = {tuple(np.round(np.array(shade) / max(shade), 1)) for shade in shades}
     expected = [np.array(colour_of(category)) for category in CATEGORIES]
     assert ratios == {tuple(np.round(c / c.max(), 1)) for c in expected}
+
+
+def test_points_of_each_cloud_nearly_touch() -> None:
+    """Objects are thinned less, so their points are smaller than those of the background."""
+    labelled, frame = scene(0, [labelled_object(1)])
+    for cloud in paint(frame, labelled.planes, labelled.objects, limit=600):
+        nearest_m = pdist(cloud.points).min()
+        assert 0.5 < cloud.radius_m / nearest_m < 0.6
 
 
 def test_unorganised_clouds_and_points_near_plane_are_painted() -> None:
