@@ -68,7 +68,8 @@ def count(detections: list[Array], labels: Array) -> Counts:
     on_objects = [float(np.mean(labels[d] >= FIRST_OBJECT_LABEL)) > 0.5 for d in detections]
     seen = object_masks(labels)
     matches = match_masks(detections, seen)
-    kept = {row for row in matches.pairs if on_objects[row]}
+    # The best matching also pairs masks that have no pixel in common.
+    kept = {row for row, k in matches.pairs.items() if on_objects[row] and matches.f[row, k] > 0}
     listed = [k for k, mask in enumerate(seen) if len(mask) >= SEEN_PIXELS]
     f = [float(matches.f[row, k]) for row, k in matches.pairs.items() if k in listed]
     found = sum(value >= MATCHED_F for value in f)

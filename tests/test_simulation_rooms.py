@@ -34,6 +34,13 @@ def test_detections_on_background_and_fragments_are_counted() -> None:
     assert total.row("all")[3:] == (3, 1, "0.500", "1.50")
 
 
+def test_fragment_is_counted_even_if_another_object_is_missed() -> None:
+    """Matching one to one pairs the fragment with the missed object, which it does not touch."""
+    labels = np.repeat([0, FIRST, FIRST + 1], 1000)
+    counts = count([np.arange(1000, 1800), np.arange(1800, 2000)], labels)
+    assert (counts.pieces, counts.found) == (1, 1)
+
+
 @pytest.mark.parametrize("kind", PROCEDURAL)
 def test_procedural_families_give_distinct_objects_of_table_size(kind: str) -> None:
     """These objects train *unknown*, so they must fit on a table, and no two may be equal."""
