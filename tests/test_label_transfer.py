@@ -956,6 +956,18 @@ def test_by_place_transfers_labels_of_another_run(
     assert [item["label"] for item in read_run(two)["corrections"]["transferred"]] == ["teapot"]
 
 
+def test_transfer_to_table_without_the_matched_track_names_it(tmp_path: Path) -> None:
+    """A line that a spreadsheet lost must not end in a traceback, with all outputs marked as old."""
+    table = tmp_path / "table.csv"
+    write_csv(table, {4: static(CUP)}, "wfar", {4: "mug"})
+    target = second(tmp_path / "target", {2: static(CUP)})
+    own = target / "tracks.csv"
+    own.write_text(own.read_text().splitlines()[0] + "\n")
+
+    with pytest.raises(OutputError, match="missing tracks: #2; restore the lines"):
+        transfer_labels(table, target)
+
+
 @pytest.mark.parametrize("confidence", ["", "nan", "inf", "-0.1", "1.01", "495"])
 def test_table_alone_with_confidence_outside_0_to_1_is_refused(
     tmp_path: Path, confidence: str

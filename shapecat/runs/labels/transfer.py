@@ -125,11 +125,11 @@ def _labelled_otherwise(transfer: Transfer, target: Path, run: RunInfo) -> dict[
         (item["track"], item["label"]) for item in run.get("corrections", {}).get("transferred", ())
     }
     current = read_track_table(target / "tracks.csv").labels
+    labels = {item: current.get(item.track, "") for item in transfer.transferred}
     return {
-        item.track: f"track #{item.track} already has the label {current[item.track]}"
-        for item in transfer.transferred
-        if current[item.track] not in ("", item.label)
-        and (item.track, current[item.track]) not in earlier
+        item.track: f"track #{item.track} already has the label {label}"
+        for item, label in labels.items()
+        if label not in ("", item.label) and (item.track, label) not in earlier
     }
 
 
