@@ -115,7 +115,7 @@ def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None
 
 
 def discontinuity_at(depth_m: float) -> float:
-    """Return the step in inverse depth that separates two surfaces at a depth, 1/m."""
+    """Return the step in inverse depth, 1/m, that separates two surfaces at ``depth_m``, metres."""
     return max(DISCONTINUITY, STEP_M / depth_m**2)
 
 

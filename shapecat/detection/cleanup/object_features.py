@@ -155,10 +155,10 @@ def _count_by_segment(
     limits: ViewLimits,
     out: Records,
 ) -> F8:
-    """Count the cells of each segment at borders and on walls, and where its surface continues.
+    """Write the counts for the surroundings of each segment to ``out`` (n + 1,), zeros before.
 
-    Also sums the heights, and the squared heights, of the samples of planes near each segment.
-    Returns the number of these samples, (n + 1,).
+    The fields ``plane_height`` and ``plane_noise`` are sums of heights and of squared heights over
+    the samples of planes near each segment. Returns the number of these samples, (n + 1,).
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity
     _, planes, (plane_id, height), low, walls = model

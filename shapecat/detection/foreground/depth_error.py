@@ -154,10 +154,10 @@ def clear_contact(
 def filter_high_pass(residual: F4, high_pass: F4) -> None:
     """For each low cell, write its residual minus the mean of the low cells in a window around it.
 
-    In the mean, a value counts as at most `LOW.max_value`. ``residual`` (rows, columns), 1/m, is 0
-    where a cell is not low; ``high_pass`` (rows, columns), 1/m, is written in place, and is 0 there
-    too. The sums are integers, in steps of 1 / `STEPS`, updated as the window slides: they are
-    exact, and take a quarter of the time of floating-point sums.
+    In the mean, a value counts as at least -1 and at most `LOW.max_value`. ``residual`` (rows,
+    columns), 1/m, is 0 where a cell is not low; ``high_pass`` (rows, columns), 1/m, is written in
+    place, and is 0 there too. The sums are integers, in steps of 1 / `STEPS`, updated as the window
+    slides: they are exact, and take a quarter of the time of floating-point sums.
     """
     rows, columns = residual.shape
     sums = np.zeros(columns + 2 * LOW.window + 1, np.int32)
@@ -216,11 +216,11 @@ def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
 
 @kernel
 def measure_noise(high_pass: F4, plane_id: I4, number: int) -> float:
-    """Return the median rise on a plane, 1/m.
+    """Return the median rise on a plane, 1/m; 0 if there is none.
 
-    A rise is the change of ``high_pass`` over `LOW.rise_cells` cells. ``high_pass`` (rows,
-    columns), 1/m, is from `filter_high_pass`; ``number``, from 1, is the plane's number in
-    ``plane_id`` (rows, columns), as in `HeightMap`.
+    A rise is the absolute change of ``high_pass`` over `LOW.rise_cells` cells to the right or down.
+    ``high_pass`` (rows, columns), 1/m, is from `filter_high_pass`; ``number``, from 1, is the
+    plane's number in ``plane_id`` (rows, columns), as in `HeightMap`.
     """
     rows, columns = high_pass.shape
     histogram = np.zeros(BINS, np.int64)

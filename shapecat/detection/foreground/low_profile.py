@@ -38,7 +38,8 @@ class Scratch(NamedTuple):
     Attributes
     ----------
     flooded : (rows, columns) int32, the number of the last part that was flooded at each cell.
-    part : (rows, columns) int32, the number of the last part whose filled hull holds each cell.
+    part : (rows, columns) int32, the number of the last part whose outline was considered, with its
+        filled hull, at each cell.
     seeds, cells : (rows * columns,) int32, lists of flat cell indices.
     """
 
@@ -255,9 +256,9 @@ def _drop_error(
 ) -> int:
     """Assign the parts of the remaining low cells to the plane if their outline shows depth error.
 
-    Cells on the side of an object are left out. The parts are numbered from ``parts`` + 1; the last
-    number is returned. ``object_ids`` is from `_mark_objects`; the other parameters are as in
-    `measure_outline`.
+    Cells on the side of an object and small parts are left out. The parts are numbered from
+    ``parts`` + 1; the last number is returned. ``object_ids`` is from `_mark_objects`; the other
+    parameters are as in `measure_outline`.
     """
     rows, columns = residual.shape
     _, part, seeds, cells = scratch
@@ -295,8 +296,8 @@ def _drop_error(
 def _is_flat(residual: F4, i: int, j: int) -> bool:
     """Return whether the surface is flat around the low cell in row ``i`` and column ``j``.
 
-    It is if the four cells two rows or two columns away are low too, and their residuals differ
-    from its own by at most `LOW.side`; on the side of an object, some are not or do not.
+    It is if the cells two rows or two columns away, within the image, are low too and have
+    residuals that differ from its own by at most `LOW.side`, unlike on the side of an object.
     ``residual`` (rows, columns), 1/m, is from `measure_residual`.
     """
     rows, columns = residual.shape

@@ -36,9 +36,11 @@ class Outline(NamedTuple):
     ----------
     sides : all sides.
     facing : sides that face the plane.
-    bounded : ``facing`` sides, sides next to higher cells, and sides in front of a farther surface.
+    bounded : ``facing`` sides, sides where the surface continues in a cell that is not low, and
+        sides in front of a farther surface.
     hidden : sides next to a nearer surface, or to a cell without depth.
-    rise : sum of the rises of the ``facing`` sides, each divided by the minimum mean rise.
+    rise : sum of the rises of the ``facing`` sides, each divided by the minimum mean rise, and at
+        most `OutlineSettings.max_rise`.
     steep : steep sides among the ``facing`` sides.
     """
 

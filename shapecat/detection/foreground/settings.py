@@ -77,8 +77,8 @@ class OutlineSettings(NamedTuple):
     broad: float = 1.5
     """Cells per side above which a part may be partly hidden: strips beside objects have fewer."""
     ragged: float = 80
-    """Largest ratio sides² / cells of a part that hardly faces the plane. The ratio of a square is
-    16, that of a crescent 50."""
+    """Largest ratio sides² / cells of a part that faces the plane with less than ``bounded_share``
+    of its sides. The ratio of a square is 16, that of a crescent 50."""
 
 
 class WallSettings(NamedTuple):

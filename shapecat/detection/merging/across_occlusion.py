@@ -68,10 +68,9 @@ def _find_shared_occluder(segments: Segments) -> Bool:
 
 @kernel(inner=True)
 def _local_planes(samples: I4, grid: DepthGrid, normal: F4) -> F8:
-    """Return the positions and normals of a segment's samples, (2, n, 3) metres, sensor frame.
+    """Return the positions, metres, and normals of a segment's samples, (2, n, 3), sensor frame.
 
-    ``samples`` (n,) are flat cell indices, -1 where there is none; ``normal`` is as in
-    `SurfaceGraph`.
+    ``samples`` (SAMPLES,) are n flat cell indices, then -1; ``normal`` is as in `SurfaceGraph`.
     """
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     n = 0
@@ -93,7 +92,8 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
     """Find the pairs of samples of two segments that lie in each other's local planes.
 
     Returns the smaller of the two segments' fractions of samples with a partner, and the positions
-    (n, 2, 3), metres, of some of the pairs. ``a`` and ``b`` are from `_local_planes`.
+    (n, 2, 3), metres, of some of the pairs; 0 and no pairs if a segment has too few samples. ``a``
+    and ``b`` are from `_local_planes`.
     """
     with_a, with_b = np.zeros(a.shape[1], np.bool_), np.zeros(b.shape[1], np.bool_)
     pairs = np.zeros((SAMPLES * SAMPLES, 2), np.uint8)

@@ -120,7 +120,7 @@ def find_adjacent(segments: Segments, p: int, view_geometry: ViewGeometry) -> Bo
     """Return which segments may belong to the same object as segment ``p``: (n + 1,) bool.
 
     Such a segment is above the same plane as ``p``, and touches, faces or occludes ``p``, is near
-    it, or is occluded by it.
+    it, or is occluded by it. There is none if ``p`` has been merged into another.
     """
     pairs, parent, plane_id = segments.pairs, segments.parent, segments.plane_id
     adjacent = np.zeros(parent.size, np.bool_)

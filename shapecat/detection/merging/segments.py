@@ -36,7 +36,7 @@ SEGMENT = np.dtype(
         ("top", "f4"),
         ("count", "f4"),  # number of cells; this and the remaining fields are sums
         ("boundary", "f4"),  # sides of cells on the boundary
-        ("area", "f4"),  # of the visible surface, m2
+        ("area", "f4"),  # of the visible surface, m2, without cells that have no local plane
         ("depth_sum", "f4"),
         ("fitted", "f4"),  # cells with a local plane; the next eleven are sums over these:
         ("position_x_sum", "f4"),  # position, sensor frame

@@ -78,7 +78,7 @@ def measure_objects(
     ----------
     labels : (rows, columns) objects 1..n, 0 elsewhere.
     representatives : (n + 1,) from `number_objects`.
-    features : (n + 1,) of the segments, from `measure_object_features`.
+    features : (segments + 1,) from `measure_object_features`.
     up : (3,) unit vector, view frame.
     plane_offsets : (n,) ``up @ p`` for the points p of the plane below each object, metres.
     """
@@ -102,11 +102,11 @@ def measure_objects(
 
 
 def _extend_to_planes(boxes: Boxes, standing: Bool, up: F8, plane_offsets: F8) -> None:
-    """Extend boxes down to their planes, in place.
+    """Extend boxes down to their planes, in place, by at most `OUTPUT.lifted_m`.
 
-    The lowest millimetres of an object are labelled as plane. ``standing`` (n,) are the objects
-    that touch their plane; ``up`` (3,) and ``plane_offsets`` (n,), metres, are as in
-    `measure_objects`.
+    The lowest millimetres of an object are labelled as plane. ``standing`` (n,) is whether each
+    object touches its plane and stands on no other object; ``up`` (3,) and ``plane_offsets`` (n,),
+    metres, are as in `measure_objects`.
     """
     gaps = boxes.center @ up - boxes.size[:, 2] / 2 - plane_offsets
     gaps[~standing | (gaps < 0) | (gaps > OUTPUT.lifted_m)] = 0
@@ -221,7 +221,7 @@ def _hidden_support(segments: Segments, representatives: I4, p: int, below: Bool
 
 @kernel(inline=True)
 def _break_cycles(supported_by: I4, support_m: F8) -> None:
-    """Put objects on their plane if they would otherwise support themselves through others.
+    """Put an object on its plane if the objects below it, one after the other, form a cycle.
 
     ``supported_by`` and ``support_m`` (n,) are as in `ObjectMeasurements`, changed in place.
     """

@@ -24,9 +24,9 @@ def label_points(
 ) -> list[U4]:
     """Return the points of each label 1, 2, ...: ascending indices (k,) uint32.
 
-    If ``fused``, points behind the visible surface, at most ``max_height_m`` above a plane, join
-    the objects they touch. Those that touch no visible object form clusters, which are further
-    lists at the end.
+    If ``fused``, points behind the visible surface, at most ``max_height_m``, metres, above a
+    plane, join the objects they touch. Those that touch no visible object form clusters, which are
+    further lists at the end, up to label `OUTPUT.max_label`.
     """
     points, grid, labels = view.points, view.grid, segmentation.plane_ids.size
     marks = np.zeros(len(points), np.int16)

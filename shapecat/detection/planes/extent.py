@@ -148,9 +148,9 @@ def _extent_of(grid: DepthGrid, plane: F8, normal: F8, ends: I4) -> F8:
 
 
 def level_coordinates(grid: DepthGrid, mask: Bool, up: F8) -> F8:
-    """Return masked samples as points (3, n) in the level frame of ``up``, metres.
+    """Return samples as points (3, n) in the level frame of ``up``, metres.
 
-    ``mask`` is (rows, columns).
+    ``mask`` (rows, columns) is True at these samples.
     """
     i, j = np.nonzero(mask)
     z = 1 / grid.inverse_depth[i, j].astype(np.float64)

@@ -200,7 +200,7 @@ def min_height_at(depth_m: float) -> float:
 
 @kernel(inner=True)
 def height_above(plane: Row, i: float, j: float, z: float) -> float:
-    """Return the height above a `PLANE` of a point at the depth z, seen at row i and column j."""
+    """Return the height of a point above a `PLANE`, metres; cell (i, j) sees it at the depth z."""
     return float((1 - (plane.a * j + plane.b * i + plane.c) * z) * -plane.offset)
 
 

@@ -100,6 +100,8 @@ def fit_peaks(
 ) -> list[F8]:
     """Fit a plane to each peak of the heights; return (a, b, c) of each plane of sufficient area.
 
+    Peaks that are not below the sensor are skipped.
+
     Parameters
     ----------
     samples, heights : the samples and their heights, from `level_samples`.
@@ -131,7 +133,7 @@ def fit_peaks(
 
 
 def _histogram_peak(heights: F4) -> np.float64:
-    """Return the middle of the bin that, with its neighbours, holds the most heights."""
+    """Return the middle of the bin that holds the most heights, with half of its neighbours'."""
     low = heights.min().astype(np.float64)
     bins = ((heights - low) / PLANES.bin_m).astype(np.int64)
     count = np.concatenate([[0], np.bincount(bins), [0]])

@@ -79,7 +79,7 @@ def ransac_plane(
 ) -> tuple[F8, int]:
     """Return the plane (a, b, c) of inverse depth with the most inliers, and their number.
 
-    If no plane has at least three inliers, the number is 0.
+    The plane is refitted to its inliers. If none has at least three inliers, the number is 0.
 
     Parameters
     ----------

@@ -213,8 +213,8 @@ def _count_below_edge(
 ) -> tuple[int, int]:
     """Count the points straight below the front edge of a plane: on a wall, and in free space.
 
-    The points begin at the edge in front of each of the ``inliers``, which are the samples of the
-    plane, and end at ``drop``, its height above the next plane below, metres.
+    The points begin just below the edge in front of each of the ``inliers``, which are the samples
+    of the plane, and go down by at most ``drop``, its height above the next plane below, metres.
     """
     on_wall = beyond = 0
     for k in range(inliers.inverse_depth.size):
@@ -282,9 +282,10 @@ def _front_edge(
 def _inverse_depth_at(
     inv_depth: F4, intrinsics: PinholeIntrinsics, x: float, y: float, z: float
 ) -> float:
-    """Return the inverse depth of the cell that shows a point, 1/m; -1 outside the image.
+    """Return the inverse depth of the cell that shows a point, 1/m.
 
-    ``inv_depth`` is (rows, columns); ``x``, ``y``, ``z`` are the point, metres, sensor frame.
+    It is 0 where depth is missing, and -1 outside the image or too near the sensor. ``inv_depth``
+    is (rows, columns); ``x``, ``y``, ``z`` are the point, metres, sensor frame.
     """
     if z <= NEAREST_M:
         return -1.0

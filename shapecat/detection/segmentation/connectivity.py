@@ -85,10 +85,10 @@ def _blank(spans: I4, columns: int) -> F4:
 
 @kernel
 def _link(grid: DepthGrid, plane_id: I4, spans: I4, local_plane: F4, links: U1) -> None:
-    """Link neighbours if their depths are similar, or if one lies on the other's local plane.
+    """Link neighbours of similar depth, or of which one lies on the local plane of the other.
 
-    ``plane_id`` is as in `HeightMap`; ``spans``, ``local_plane`` and ``links``, which is written,
-    are as in `SurfaceGraph`.
+    Both must be above the same supporting plane. ``plane_id`` is as in `HeightMap`; ``spans``,
+    ``local_plane`` and ``links``, which is written, are as in `SurfaceGraph`.
     """
     inv_depth, jump = grid.inverse_depth, np.float32(grid.discontinuity)
     rows, columns = inv_depth.shape

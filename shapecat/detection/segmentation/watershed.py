@@ -45,8 +45,8 @@ def watershed(
 def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n: int) -> int:
     """Label connected parts of unlabelled cells with concavity below ``edge_deg``, from ``n`` + 1.
 
-    Small parts stay unlabelled. Returns the last label. ``plane_id`` is as in `HeightMap`;
-    ``labels`` (rows, columns), 0 where unlabelled, is changed in place.
+    Parts that `_min_size` does not choose stay unlabelled. Returns the last label. ``plane_id`` is
+    as in `HeightMap`; ``labels`` (rows, columns), 0 where unlabelled, is changed in place.
     """
     inside: Bool = np.zeros(labels.shape, np.bool_)
     concavity, spans, threshold = graph.concavity, graph.spans, np.uint8(edge_deg)
@@ -72,8 +72,9 @@ def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n
 def _min_size(sizes: I4, n: int) -> tuple[int, int]:
     """Choose the largest components, as many as there is room for beside ``n`` segments.
 
-    ``sizes`` (k,) are those of the components, from 1. Returns a size and a number: all larger
-    components are chosen, and this many of exactly that size.
+    Those with fewer cells than `SegmentationSettings.min_cells` are never chosen. ``sizes`` (k,)
+    are the sizes of components 1..k - 1. Returns a size and a number: all larger components are
+    chosen, and this many of exactly that size.
     """
     min_size, room = SEGMENTATION.min_cells - 1, SEGMENTATION.max_segments - n
     while True:

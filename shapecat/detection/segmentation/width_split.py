@@ -178,7 +178,7 @@ def _second(end: F4, k: int, sign: float) -> float:
 
 @kernel(inner=True)
 def _slope_of(end: F4, k: int) -> float:
-    """Return the mean difference of consecutive values over the four values from ``end[k]``.
+    """Return the change per band from the first two to the last two of the values ``end[k:k + 4]``.
 
     ``end`` (BANDS,) is a row of `Outlines.ends`.
     """
