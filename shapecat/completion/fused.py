@@ -145,7 +145,8 @@ def _near(centers: F8, place: F8) -> Bool:
 def _not_turned(axes: F8, sizes: F8, weights: F8) -> Bool:
     """Return in which views (k,) an object that stands in one place has its most common yaw.
 
-    ``axes`` (k, 3, 3) and ``sizes`` (k, 3) are as in `BoxViews`; ``weights`` (k,) are the views'.
+    These are all views if no yaw is steady. ``axes`` (k, 3, 3) and ``sizes`` (k, 3) are as in
+    `BoxViews`; ``weights`` (k,) are the views'.
     """
     result = np.ones(len(axes), np.bool_)
     best_weight, elongation = 0.0, _elongation(sizes)

@@ -174,10 +174,10 @@ def _extents(points: F4, height: float, eye: F4, out: F4) -> tuple[float, float,
 
 @kernel(inline=True)
 def _spreads(x: F4, y: F4, z: F4, weight: F4, normals: F4, out: F4) -> None:
-    """Compare the principal variances of the neurons and of the normals; write to ``out`` (7,).
+    """Write the principal variances, and how vertical principal axes are, to ``out`` (7,).
 
-    ``x``, ``y``, ``z`` and ``weight`` are as in `_sphere`; ``normals`` (3, k) is from
-    `fit_surfaces`.
+    First those of the neurons, relative to the largest variance; then those of the normals. ``x``,
+    ``y``, ``z`` and ``weight`` are as in `_sphere`; ``normals`` (3, k) is from `fit_surfaces`.
     """
     spread, bend = np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(x.size):
