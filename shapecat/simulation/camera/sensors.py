@@ -23,7 +23,7 @@ class Sensor:
     relative_noise : standard deviation of the depth, relative to the depth, for time-of-flight
         cameras.
     noise_window : (across, down) correlation window of the noise, pixels.
-    smoothings : number of times that the noise and the edge jitter are averaged over their windows.
+    smoothings : number of times that ``noise`` and the edge jitter are averaged over their windows.
     fixed_error : standard deviation of the device's low-frequency error of the inverse depth, 1/m;
         the error is the same in all images.
     fixed_error_px : distance over which this error varies, pixels.

@@ -55,7 +55,7 @@ def make_own_arms(rng: Generator, camera: Pose, height: float) -> list[Mesh]:
     """
     ahead = camera.rotation[:, 2]
     distance = (camera.translation[2] - height) / max(-float(ahead[2]), 0.3)
-    below = 1 if rng.random() < 0.75 else -1  # otherwise the camera sees the robot's own body
+    below = 1 if rng.random() < 0.75 else -1  # otherwise the camera looks back at the robot
     links: list[Mesh] = []
     for side in rng.permutation([-1, 1])[: int(rng.integers(1, 3))]:
         thick = rng.uniform(0.035, 0.09)
@@ -135,7 +135,7 @@ def _resting_arm(rng: Generator, start: F8, end: F8) -> list[Mesh]:
 def _links(joints: Sequence[F8], radii: Sequence[float]) -> list[Mesh]:
     """Return a tube between consecutive joints, and a motor at each joint except the first.
 
-    ``joints`` are their positions (3,), ``radii`` those of the tubes, metres.
+    ``joints`` are positions (3,), ``radii`` the radii of the tubes, metres.
     """
     parts = []
     for (start, end), radius in zip(pairwise(joints), radii, strict=True):

@@ -86,7 +86,7 @@ def make_scene(
 
 
 def _tabletop(rng: Generator, spec: _SceneSpec) -> World:
-    """Place up to ten objects, with gaps, on a table: at least one of each category."""
+    """Place up to ten objects, with gaps, on a table: one of each category first."""
     room, table = make_room(rng, wall_chance=0.3), make_table(rng)
     layout = Layout(rng, gap=rng.uniform(0.015, 0.05))
     count = int(rng.integers(max(6, len(spec.categories)), 11))

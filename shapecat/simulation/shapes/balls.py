@@ -13,7 +13,7 @@ __all__ = ["make_ball"]
 
 
 def make_ball(rng: Generator) -> Mesh:
-    """Make a ball: a sphere, often slightly ellipsoidal (0.97 to 1.03), or a round fruit."""
+    """Make a ball: a sphere, often stretched along each axis by 0.97 to 1.03, or a round fruit."""
     diameter = log_uniform(rng, 0.032, 0.24)
     scale = rng.uniform(0.97, 1.03, 3) if rng.random() < 0.6 else 1.0
     quaternion = np.round(rng.normal(size=4), 6)
