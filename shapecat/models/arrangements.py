@@ -200,7 +200,7 @@ def _tilted(item: ArrangedObject, rng: np.random.Generator) -> ArrangedObject:
 def placed(
     item: ArrangedObject, spot: tuple[float, float], support_m: float, rng: np.random.Generator
 ) -> ArrangedObject:
-    """Turn an object randomly about z and place it at ``spot`` (x, y), on a support, in metres.
+    """Turn an object randomly about z and place it on a support at ``spot`` (x, y), metres.
 
     ``support_m`` is the height of the support.
     """

@@ -24,7 +24,7 @@ def mesh_views(
     Parameters
     ----------
     placements : number of rounds. In each, a mesh is placed 3 times upright and 2 times lying;
-        balls, bowls and plates are always upright.
+        balls, bowls and plates are always upright. A mesh without such a stable pose gets any.
     cameras : number of images of each placement; their views share an instance name.
 
     Raises

@@ -27,7 +27,7 @@ def split_necks(graph: SurfaceGraph, labels: I4, n: int) -> int:
     Two round objects that touch share a narrow bridge, in which the concave edge between them ends.
     Cells are visited by their distance from the border, the innermost first. A cell with no visited
     neighbour starts a basin; any other joins a basin beside it. Where two basins meet, they are
-    merged, unless both are large, and much wider than the region is there.
+    merged, unless both are much wider than the region is there, and the narrower one is not tiny.
 
     Parameters
     ----------

@@ -65,7 +65,7 @@ class SimulatedView(NamedTuple):
     label : true category, or ``unknown``.
     instance : name of the object.
     points : number of voxels.
-    distance : mean distance from the sensor, metres.
+    distance : distance of the sensor from the mean of the points, metres.
     resting_pose : ``upright``, ``lying``, ``upside_down``, ``leaning`` or ``tilted``.
     source : how the view was segmented: ``truth``, ``detected`` or ``fragment``; or ``background``,
         for a thin detection that shows no object and has the label ``unknown``.
