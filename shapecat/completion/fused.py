@@ -248,7 +248,7 @@ def _turned(outlines: F8, angles: F8) -> F8:
 
 
 def _alike(axes: F8, sizes: F8, size: F8) -> F8:
-    """Return axes (k, 3, 3), turned by 90 degrees if the longer one is not that of ``size``.
+    """Return axes (k, 3, 3), turned by 90 degrees where their longer side is shorter in ``size``.
 
     ``sizes`` (k, 3) are the lengths along these axes, ``size`` (3,) those of the fused box.
     """

@@ -146,7 +146,7 @@ def context(
 def _extents(points: F4, height: float, eye: F4, out: F4) -> tuple[float, float, float]:
     """Write ratios of the height and of horizontal widths to ``out`` (5,); return three widths.
 
-    They are the largest width, and the widths across and along the line of sight. ``points`` (3, n)
+    The widths are the largest one, and those across and along the line of sight. ``points`` (3, n)
     and ``eye`` (3,) are as in `Surface`; ``height`` is that of the points.
     """
     ex, ey = eye[0], eye[1]
@@ -174,10 +174,11 @@ def _extents(points: F4, height: float, eye: F4, out: F4) -> tuple[float, float,
 
 @kernel(inline=True)
 def _spreads(x: F4, y: F4, z: F4, weight: F4, normals: F4, out: F4) -> None:
-    """Write the principal variances, and how vertical principal axes are, to ``out`` (7,).
+    """Write features of the principal axes of the neurons, and of the normals, to ``out`` (7,).
 
-    First those of the neurons, relative to the largest variance; then those of the normals. ``x``,
-    ``y``, ``z`` and ``weight`` are as in `_sphere`; ``normals`` (3, k) is from `fit_surfaces`.
+    They are variances, for the neurons relative to the largest one, and how vertical an axis is.
+    ``x``, ``y``, ``z`` and ``weight`` are as in `_sphere`; ``normals`` (3, k) is from
+    `fit_surfaces`.
     """
     spread, bend = np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(x.size):

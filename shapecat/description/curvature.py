@@ -74,8 +74,8 @@ def fit_surfaces(
     """Fit a quadric around each neuron.
 
     The neighbourhood is all points within a radius of the neuron. A full quadric is fitted to the
-    heights of these points above their least-squares plane (ridge regression). The curvatures
-    follow from the first and second fundamental forms.
+    heights of these points along the normal of their least-squares plane (ridge regression). The
+    curvatures follow from the first and second fundamental forms.
 
     Parameters
     ----------

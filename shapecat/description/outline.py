@@ -32,8 +32,8 @@ def outline(cloud: F4, eye: F4, out: F4) -> None:
     """Write the features named by `OUTLINE_NAMES`.
 
     Widths are measured in slices along two directions: upwards, and along the principal axis of the
-    outline from its wide to its narrow end. The feature ``aside`` is the offset of a slice's middle
-    from the mean of all slices.
+    outline from its wide to its narrow end. The feature ``aside`` is the distance of a slice's
+    middle from the mean of all middles.
 
     Parameters
     ----------

@@ -187,9 +187,9 @@ def _turn_to_mean(normals: F4, direction: F8) -> int:
 
 @kernel(inline=True)
 def _hypotheses(directions: F8, corner_cos: float) -> F8:
-    """Return candidates for up (n, 3): the directions found, and perpendiculars to two of them.
+    """Return candidates for up (n, 3): the directions found, and both normals of pairs of walls.
 
-    ``directions`` are from `_directions`; two of them are perpendicular enough if the absolute
+    ``directions`` are from `_directions`; two of them may be walls in a corner if the absolute
     value of their cosine is below ``corner_cos``.
     """
     n = len(directions)

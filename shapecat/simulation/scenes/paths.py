@@ -72,7 +72,7 @@ def arc_orbit(
     radius = distance * (1 + 0.1 * np.sin(slow[0] * t + shift[0]))
     up = np.radians(elevation + 4 * np.sin(slow[1] * t + shift[1]))
     flat = radius * np.cos(up)
-    step = 2 * np.pi * 1.8  # steps per second
+    step = 2 * np.pi * 1.8  # 1.8 steps per second
     bob = 0.006 * np.sin(step * t + shift[2])
     eye = np.stack(
         [
