@@ -176,9 +176,8 @@ def _extents(points: F4, height: float, eye: F4, out: F4) -> tuple[float, float,
 def _spreads(x: F4, y: F4, z: F4, weight: F4, normals: F4, out: F4) -> None:
     """Write features of the principal axes of the neurons, and of the normals, to ``out`` (7,).
 
-    They are variances, for the neurons relative to the largest one, and how vertical an axis is.
-    ``x``, ``y``, ``z`` and ``weight`` are as in `_sphere`; ``normals`` (3, k) is from
-    `fit_surfaces`.
+    They are variances (those of the neurons relative to the largest) and how vertical the axes are.
+    Inputs: ``x``, ``y``, ``z`` and ``weight`` of `_sphere`; ``normals`` (3, k) of `fit_surfaces`.
     """
     spread, bend = np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(x.size):

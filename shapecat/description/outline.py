@@ -90,9 +90,9 @@ def _widths(
 ) -> tuple[float, float]:
     """Write width and offset of each slice to ``out``, relative to the largest width.
 
-    ``along`` and ``across`` (n,) are coordinates of the points; the slices divide the range of
-    ``along``. With ``to_narrow``, the slices go from the wide to the narrow end. Returns length /
-    (length + largest width), and the mean width divided by the largest.
+    ``along`` and ``across`` (n,) are coordinates of the points; the slices divide the length, which
+    is the `inner_range` of ``along``. With ``to_narrow``, they go from the wide to the narrow end.
+    Returns length / (length + largest width), and the mean width divided by the largest.
     """
     low, high = inner_range(along)
     length = max(high - low, 1e-6)

@@ -53,6 +53,8 @@ def evaluate_model(
 ) -> None:
     """Evaluate a model; write its card and the picture of its worst mistakes into a folder.
 
+    The results are also printed.
+
     Parameters
     ----------
     sets : the views of each set in `SETS`, by name.

@@ -25,7 +25,7 @@ CONTEXT_FEATURES = np.dtype(
     ],
     align=True,
 )
-"""The features of a segment, its own classification, and those of its neighbours."""
+"""The features of a segment, its classification alone, and its neighbours' classifications."""
 
 
 def measure_borders(segments: Segments, roots: I4) -> F4:

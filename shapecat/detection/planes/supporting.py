@@ -118,7 +118,8 @@ def _is_centred_on(lower: SupportingPlane, upper: SupportingPlane) -> bool:
 def _extend_to_walls(grid: DepthGrid, plane: SupportingPlane) -> SupportingPlane:
     """Extend the floor of a bin to the walls, since objects hide parts of it.
 
-    The extent grows to the samples above the floor that are within 0.2 m of its visible part.
+    The extent grows to the samples up to 0.4 m above the floor and within 0.2 m of its visible
+    part.
     """
     across, along, height = level_coordinates(grid, grid.inverse_depth > 0, plane.up)
     above = height - plane.offset
