@@ -102,7 +102,8 @@ def complete(
 
     Parameters
     ----------
-    points : (n, 3) metres, sensor frame, finite; the sensor is at the origin.
+    points : (n, 3) metres, sensor frame, finite; the sensor is at the origin. If there are more
+        than `ENOUGH_POINTS`, every k-th point is used.
     up : (3,) unit vector, sensor frame.
     offset : metres, ``up @ p`` for the points p of the support.
     posterior : (c,) probabilities, in the order of ``categories``.

@@ -113,8 +113,8 @@ def _homography(camera: Camera, earlier_from_sensor: Pose) -> tuple[F4, F4]:
 def _expected_depth(depth: F4, range_m: float) -> F4:
     """Return the depths (h, w), metres, to compare with earlier images; negative for holes.
 
-    A hole gets the negative depth of the nearest pixel in its row or column, at most `REACH` away.
-    It is 0 if there is none. Depths beyond the range are 0, too.
+    A hole gets the negative depth of the nearest pixel with depth in its row or column, at most
+    `REACH` away, or 0 if there is none. Depths beyond the range are 0, too.
     """
     rows, columns = depth.shape
     expected = np.zeros((rows, columns), np.float32)

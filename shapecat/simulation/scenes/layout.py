@@ -124,7 +124,7 @@ class Layout:
         ----------
         half : (2,) half the size in x and y, metres, of the area around the support's centre in
             which to place it.
-        stack : probability of placing it on another object.
+        stack : probability of first trying to place it on another object.
         attempts : number of objects to make and try before giving up.
         """
         for _ in range(attempts):
