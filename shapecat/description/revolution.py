@@ -35,8 +35,9 @@ def revolution(surface: Surface, normals: F4, axis: F8, point: F8, foot: F8, out
 
     Two solids of revolution are fitted to the neurons and measured on the points: one with a
     vertical axis, and one whose axis may tilt. The second is cut into slices, from its wide to its
-    narrow end. The features of a slice are its fraction of the points, the mean radius (relative to
-    the largest), the deviation from that radius, and the fraction of the points that face the axis.
+    narrow end. The features of a slice are its fraction of the points, the mean radius and its
+    standard deviation (relative to the largest mean radius), and the fraction of the points that
+    face the axis.
 
     Parameters
     ----------

@@ -71,7 +71,8 @@ class SimulatedView(NamedTuple):
         for a thin detection that shows no object and has the label ``unknown``.
     visible : number of the object's depth pixels, divided by its number of pixels if nothing
         occluded it.
-    overlap : IoU of the view's points and the object's depth pixels.
+    overlap : IoU of the detection and the object's depth pixels, for a fragment before it was cut;
+        1 for views that are not from a detection, and for background.
     sensor : name of the sensor.
     view : the voxels; None if not kept.
     """

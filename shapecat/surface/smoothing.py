@@ -59,8 +59,9 @@ def smooth(points: F4, *, radius_m: float) -> F4:
 
     Returns
     -------
-    (m, 3) the moved points, in their order. With 4 to 8 points within the radius, only the plane is
-    used; points with fewer are dropped, since they belong to no surface.
+    (m, 3) the moved points, in their order. With 4 to 8 points within the radius, or if
+    ``|g(0, 0)|`` is h or more, only the plane is used. Points with fewer than 4 are dropped, since
+    they belong to no surface.
 
     Raises
     ------

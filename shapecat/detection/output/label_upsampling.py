@@ -36,8 +36,8 @@ def label_pixels(
     """Return the pixels of each label 1, 2, ...: ascending flat indices (k,) uint32.
 
     A pixel takes the label of its cell if their depths agree, else the label of the neighbouring
-    cell whose depth agrees best. The pixel keeps that label only if it is above the plane or in a
-    cell of `Segmentation.filled`.
+    cell whose depth agrees best, if any does. The pixel keeps that label only if it is above the
+    plane or in a cell of `Segmentation.filled`.
 
     Parameters
     ----------

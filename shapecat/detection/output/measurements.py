@@ -71,8 +71,8 @@ def measure_objects(
 ) -> ObjectMeasurements:
     """Measure the boxes, the supports and the flags of the objects.
 
-    A box is a `shapecat.geometry.upright_box` around the outermost cells of an object. If the
-    object touches its plane, the box reaches down to the plane.
+    A box is a `shapecat.geometry.upright_box` around the outermost and some inner cells of an
+    object. If the object stands on its plane, the box reaches down to the plane.
 
     Parameters
     ----------

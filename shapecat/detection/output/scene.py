@@ -37,6 +37,9 @@ def build_scene(
 ) -> Scene:
     """Build the scene, in the sensor frame, from labelled cells and the points of each label.
 
+    Objects with too few points are left out, and so are those above an assumed plane that the
+    border or the range limit cuts off, and those that the view does not show if they are too large.
+
     Parameters
     ----------
     indices : for each label from 1, the ascending indices of its points in the frame. Further lists
@@ -139,7 +142,7 @@ def _boxes(
 
 
 def _at_image_border(grid: DepthGrid, segmentation: Segmentation, _: Pose) -> Bool:
-    """Return whether each object reaches the border of the image, or a blank strip along it."""
+    """Return for each object (n,) whether it reaches the image border or a blank strip along it."""
     boxes, band = segmentation.measured.boxes, max(1, round(2 / grid.factor))
     shape = grid.inverse_depth.shape
     truncated = np.zeros(len(boxes.low), bool)

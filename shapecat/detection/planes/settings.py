@@ -39,8 +39,8 @@ class UpSettings(NamedTuple):
     """Fraction of the score that a direction along the optical axis loses: it is likely the normal
     of a wall."""
     roll_penalty: float = 4.0
-    """The score of a direction that implies a camera on its side or upside down is divided by 1
-    plus this."""
+    """The score of a direction that implies a camera on its side or upside down is divided by up to
+    1 plus this, depending on the roll."""
     frontal_sin2: float = 0.03
     """Squared sine of the angle to the optical axis below which a direction implies no roll."""
     half_weight_m: float = 1.5

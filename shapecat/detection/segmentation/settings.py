@@ -35,7 +35,7 @@ class SegmentationSettings(NamedTuple):
     """Minimum concave angle that may separate two objects; the inside of a 7 cm bowl turns by 16
     degrees over the same number of cells."""
     min_cells: int = 12
-    """Minimum number of cells of a segment; smaller parts join the segments around them."""
+    """Minimum number of cells of a segment; smaller parts join a segment beside them, if any."""
     max_segments: int = 250
     """Maximum number of segments. Only the largest are kept, since the time grows with the square
     of their number."""

@@ -29,9 +29,9 @@ def watershed(
     """Split the object cells into segments at depth discontinuities and concave edges.
 
     Each connected component of flat cells is a seed. A flood from the seeds, flattest cells first,
-    assigns the cells of concave edges to the segments beside them (Meyer 1991); parts that it does
-    not reach become segments too. ``split_seeds`` may split the seeds first. Returns the labels
-    1..n, 0 elsewhere, (rows, columns) int16, and n.
+    assigns the cells of concave edges to the segments beside them (Meyer 1991). Parts that it does
+    not reach become segments too, unless they are small. ``split_seeds`` may split the seeds first.
+    Returns the labels 1..n, 0 elsewhere, (rows, columns) int16, and n.
     """
     labels = np.zeros(heights.plane_id.shape, np.int16)
     n = _label_parts(heights.plane_id, graph, SEGMENTATION.edge_deg, labels, 0)
