@@ -210,9 +210,9 @@ def _mean_axes(axes: F8, sizes: F8, weights: F8) -> F8:
 
 
 def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F8]:
-    """Return the median outline about ``origin``, and the fraction of views seeing each direction.
+    """Return the median outline about ``origin``, and the share of views seeing each direction.
 
-    Both are (96,). ``weights`` (k,) are the views'; ``origin`` (3,) is in metres. The directions
+    Both are (96,), and use the views' ``weights`` (k,). ``origin`` (3,) is in metres. Directions
     begin at the first of the axes ``base``, and turn towards the second.
     """
     around = _turned(views.outlines, _yaws(base, views.axes))

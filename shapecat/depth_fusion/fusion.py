@@ -179,7 +179,7 @@ def _add_unmoved(expected: F4, earlier: F4, total: F4, count: F4) -> None:
 
 @kernel
 def _add_moved(expected: F4, earlier: F4, homography: F4, shift: F4, total: F4, count: F4) -> None:
-    """Add the earlier depths that agree to ``total`` (h, w), and their number to ``count`` (h, w).
+    """Add to ``total`` (h, w) the earlier depths that agree, and to ``count`` (h, w) their number.
 
     They are converted to depths in the current camera. The depth of a hole is also written to
     ``expected``. The other parameters are as in `_agreeing_share`.

@@ -131,7 +131,7 @@ def _smooth(points: F4, radius: float, cells: I4, size: I4, order: I4) -> F4:
 def _neighbours(
     points: F4, i: int, radius: float, cell: int, size: I4, keys: I4, order: I4, offsets: F8
 ) -> int:
-    """Write the neighbours of point i to ``offsets``, and return their number.
+    """Write the neighbours of point i, itself included, to ``offsets``; return their number.
 
     A row of ``offsets`` (n, 4) is the offset of a neighbour from the point, in radii, and the
     weight of the neighbour. ``cell`` is the cell of point i, ``keys`` (n,) are the cells of all

@@ -124,7 +124,7 @@ class World(Record):
         return len(self.path)
 
     def pose_of(self, item: PlacedObject, frame: int) -> Pose:
-        """Return ``world_from_mesh`` of an object in a frame, or its first pose if it is absent."""
+        """Return ``world_from_mesh`` of an object in a frame; an absent object is not shifted."""
         shift = self._shifts.get(item.track)
         pose = item.pose
         if shift is not None and np.isfinite(shift[frame]).all():
