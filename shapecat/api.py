@@ -81,9 +81,10 @@ class OpenRecording:
         end_s: float | None = None,
         every: int = 1,
     ) -> Iterator[Frame]:
-        """Yield the frames of depth sensors in order of log time; the options are as for `process`.
+        """Yield the frames of depth sensors; the options are as for `process`.
 
-        Unreadable frames are skipped.
+        Frames are in the order of the recording, except that a depth image may wait for its
+        calibration. Unreadable frames are skipped.
 
         Raises
         ------
@@ -132,8 +133,8 @@ def process(
     """Process one recording as `shapecat process` does, and open the results.
 
     The results are written to ``out/NAME``, where NAME is the name of the recording without its
-    suffix. Complete results of the same input, settings and model are opened instead of being
-    computed again.
+    suffix. Without ``overwrite``, complete results of the same input, settings and model are opened
+    instead of being computed again.
 
     Parameters
     ----------

@@ -250,7 +250,10 @@ def _parse_value(text: str) -> Any:
 
 
 def _replace(group: Any, tree: Mapping[str, Any], prefix: str) -> Any:
-    """Return a group of settings with some values replaced; ``prefix`` precedes their names."""
+    """Return a group of settings with some values replaced.
+
+    ``prefix`` precedes their names in messages, such as ``detection.``.
+    """
     hints = get_type_hints(type(group))
     changes = {}
     for key, value in tree.items():

@@ -83,7 +83,7 @@ def listed(names: Sequence[str]) -> str:
 
 
 def printable(text: str) -> str:
-    r"""Escape the control characters of a text, except line ends.
+    r"""Escape the control characters of a text, except newlines.
 
     Names in a recording may hold sequences that change or clear the terminal.
 

@@ -185,7 +185,7 @@ def level_from_sensor(up: ArrayLike, offset: float, points: ArrayLike) -> Pose:
 
     Parameters
     ----------
-    up : (3,) vector of any length but zero, sensor frame.
+    up : (3,) unit vector, sensor frame.
     offset : metres, ``up @ p`` for the points p of the support.
     points : (n, 3) points of the object, metres, sensor frame, finite.
 

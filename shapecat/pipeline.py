@@ -68,10 +68,10 @@ _log = logging.getLogger(__name__)
 def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
     """Process one recording into its run folder: perceive, revise, track, annotate.
 
-    A complete folder made from the same input, settings and model is kept, and gets the outputs
-    that it lacks. A new folder gets its final name only when it is complete; an interrupted run
-    resumes where it stopped. If a run replaces one that differs only in settings of tracking or
-    outputs, it keeps the perceived frames.
+    Unless the job overwrites it, a complete folder made from the same input, settings and model is
+    kept, and gets the outputs that it lacks. A new folder gets its final name only when it is
+    complete; an interrupted run resumes where it stopped. If a run replaces one that differs only
+    in settings of tracking or outputs, it keeps the perceived frames.
 
     Parameters
     ----------
@@ -169,6 +169,8 @@ def _add_outputs(
     job: Job, recording: Recording, planned: RunInfo, content: ContentDigest, observe: Observer
 ) -> Summary:
     """Write the outputs that ``planned`` requests and a complete folder lacks; return its summary.
+
+    Nothing is written if the results are at a URL. The options in ``planned`` change in place.
 
     Raises
     ------

@@ -146,7 +146,7 @@ def rehearse() -> None:
 
 
 def compile_all(observe: Observer = ignore, *, cores: int = 2, colour: bool = False) -> float:
-    """Compile the kernels in other processes unless that is done; return the seconds it took.
+    """Compile missing kernels, if possible in other processes; return the duration in seconds.
 
     If another call, here or in another process, is compiling them, wait for it.
 

@@ -35,7 +35,8 @@ def distort(rays: F8, model: str, coefficients: Sequence[float]) -> F8:
     Parameters
     ----------
     model : one of `LENS_MODELS`, or empty for a lens without distortion.
-    coefficients : in OpenCV's order; missing ones are 0, and only the first 8 are used.
+    coefficients : in OpenCV's order; missing ones are 0, and only the first 8, or 4 of a fisheye
+        lens, are used.
 
     Raises
     ------
@@ -65,7 +66,8 @@ def undistorted_rays(camera: Camera, model: str, coefficients: Sequence[float]) 
     Returns
     -------
     (h, w, 2) slopes, NaN at pixels where the iteration does not converge; None if it converges
-    at fewer than 30 % of the pixels, the model is not known, or a coefficient is not finite.
+    at fewer than 30 % of the pixels, ``model`` is not one of `LENS_MODELS` (also if it is empty),
+    or a coefficient is not finite.
     """
     if model not in LENS_MODELS or not np.isfinite(coefficients).all():
         return None

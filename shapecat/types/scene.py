@@ -170,7 +170,7 @@ class ImageMasks(Record):
     boxes : left, top, width and height of each mask, pixels, by the number of the detection (from
         0); detections that the image does not show are missing.
     counts : by the same numbers, the (n,) uint32 run lengths of each mask, from
-        `shapecat.colour.rle.rle_counts`.
+        `shapecat.colour.rle.rle_counts`; empty if they were not read.
     """
 
     topic: str
