@@ -64,15 +64,15 @@ def dense_masks(
 
     Labelled depth pixels are projected into the colour image, where the nearest one shows. Narrow
     gaps between pixels of the same object are filled, and so are unknown pixels that an object
-    surrounds.
+    surrounds. A majority filter smooths the outlines.
 
     Parameters
     ----------
     frame : a depth image.
     objects : for each object, (k,) uint32 flat indices of its pixels in the frame.
-    lens : the colour camera; not needed for a registered image.
-    colour_from_depth : pose of the depth sensor in the optical frame of the colour camera; None for
-        a registered image, whose pixels coincide with those of the depth image.
+    lens : the colour camera.
+    colour_from_depth : pose of the depth sensor in the optical frame of the colour camera. If it or
+        ``lens`` is None, the image is registered: its pixels coincide with the depth image's.
 
     Returns
     -------
@@ -245,7 +245,7 @@ def _majority(labels: I4, label: int, radius: int, pixels: Bool) -> tuple[int, i
 
     ``labels`` (h, w) are those of the pixels. The square extends ``radius`` pixels to each side;
     only its part within ``labels`` counts. Returns left, top, right + 1 and bottom + 1 of the
-    pixels that are set.
+    pixels that are set; (w, h, 0, 0) if none is.
     """
     height, width = labels.shape
     west, north, east, south = width, height, 0, 0

@@ -110,7 +110,7 @@ def _sources(lens: LensCamera) -> F8:
 
 @lru_cache(maxsize=16)
 def _monotonic_up_to(lens: LensCamera) -> float:
-    """Return the slope up to which the distortion increases monotonically.
+    """Return the slope, at most `_WIDEST`, up to which the distortion increases monotonically.
 
     Beyond it the polynomial turns back, and would map the sides of the scene into the image.
     """

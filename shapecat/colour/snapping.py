@@ -126,9 +126,10 @@ def _compare(colours: U1, depth: F4, band: float, core: float, window: int, log_
     """Write to ``log_ratio`` the log-likelihood ratio of inside to outside, for pixels in the band.
 
     The colours of each side are modelled by a normal distribution with the same variance in all
-    channels, fitted to a grid of pixels around the pixel. ``colours`` are (h, w, 3). ``depth`` (h,
-    w) is the distance from the outline in pixels, positive inside. ``band``, ``core`` and
-    ``window`` are as `_BAND_PX`, `_CORE_PX` and `_WINDOW_PX`, in pixels of the colour image.
+    channels, fitted to a grid of pixels around the pixel; pixels with too few samples are left out.
+    ``colours`` are (h, w, 3); ``depth`` and ``log_ratio`` (h, w). ``depth`` is the distance from
+    the outline in pixels, positive inside. ``band``, ``core`` and ``window`` are as `_BAND_PX`,
+    `_CORE_PX` and `_WINDOW_PX`, in pixels of the colour image.
     """
     height, width, channels = colours.shape
     step = max(1, window // 4)

@@ -17,7 +17,7 @@ _FOOTPRINT_PX = 0.05
 _HIDDEN = 0.02
 """A surface hides an object if it is nearer by more than this fraction of the object's depth."""
 _SPARSE = 4
-"""Outside objects, only every fourth row and column of the depth image is used."""
+"""Outside objects, only every fourth pixel of every fourth row of the depth image is used."""
 _BESIDE_PX = 30
 """Margin around the objects in the colour image, in depth pixels."""
 
@@ -122,9 +122,9 @@ def _splat(
 
 @kernel(inner=True)
 def _sample_background(depth: F4, pixels: U4) -> U4:
-    """Return, in every `_SPARSE`-th row and column, the pixels with depth that are not listed.
+    """Return every `_SPARSE`-th pixel of every `_SPARSE`-th row that has depth and is not listed.
 
-    ``pixels`` lists flat indices into ``depth``, and so does the result.
+    ``pixels`` (n,) lists flat indices into ``depth``, and so does the result (k,).
     """
     rows, columns = (depth.shape[0] - 1) // _SPARSE + 1, (depth.shape[1] - 1) // _SPARSE + 1
     outside = np.ones((rows, columns), np.bool_)
@@ -252,7 +252,7 @@ def _paint(
 
 @kernel(inner=True)
 def _nearest_surface(around: F4, corner: tuple[int, int], cell: int, shape: tuple[int, int]) -> F4:
-    """Return the largest inverse depth of points in each cell of a window.
+    """Return the largest inverse depth of points in each cell of a window; 0 without points.
 
     ``around`` is from `_project_pixels`; ``corner`` is left and top of the window, ``shape`` its
     height and width; cells are squares of ``cell`` pixels.

@@ -12,7 +12,8 @@ __all__ = ["agreement"]
 _SAMPLES = 256
 """Approximate number of points that are sampled."""
 _KNOWN = 0.5
-"""Minimum fraction of the sampled points that can be compared; others have no depth to compare."""
+"""Minimum fraction of the sampled points that must be comparable; points without depth in either
+image are not."""
 
 
 def agreement(
@@ -67,6 +68,9 @@ def _compare(
     translation: F8,
 ) -> tuple[int, int, float]:
     """Return the numbers of compared and agreeing points, and the latter's summed differences, 1/m.
+
+    Only a sample of the points is compared. Points that ``other`` cannot see count as compared, but
+    not points without depth in either image.
 
     Parameters
     ----------

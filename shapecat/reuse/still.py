@@ -28,7 +28,8 @@ def shows_the_same(
     Parameters
     ----------
     frame, key_frame : the frames to compare.
-    pose, key_pose : ``fixed_from_sensor`` of each; None where there is no fixed frame.
+    pose, key_pose : ``fixed_from_sensor`` of each; None where there is no fixed frame. If both are
+        None, they count as equal.
     range_m : metres; depths farther away in both frames are not compared.
 
     Notes
@@ -76,7 +77,7 @@ def _changed(depth: F4, key_depth: F4, range_m: float) -> bool:
 def _mark(depth: F4, key_depth: F4, range_m: float, differs: Bool) -> None:
     """Mark the depths of a row that differ, unless both are out of range.
 
-    All arrays are (w,); the marks go to ``differs``. ``range_m`` is the range, metres.
+    All arrays are (w,); the marks go to ``differs``. The other parameters are as in `_changed`.
     """
     for u in range(len(depth)):
         a, b = depth[u], key_depth[u]

@@ -104,8 +104,8 @@ class KeyView(NamedTuple):
 class Move(NamedTuple):
     """The motion of the sensor between an earlier and a later view.
 
-    ``pose`` is ``later_from_earlier``, ``back`` its inverse, and ``quaternion`` (4,) x, y, z, w
-    its rotation.
+    ``pose`` is ``later_from_earlier``; ``quaternion`` (4,) x, y, z, w is the rotation of ``pose``,
+    and ``back`` its inverse.
     """
 
     pose: Pose
