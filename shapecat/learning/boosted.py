@@ -55,7 +55,7 @@ def grow_ensemble(
 
     Parameters
     ----------
-    features : (n, f).
+    features : (n, f) standardised features of n views.
     labels : (n,) index of each view's true logit; each logit is true for at least one view.
     rounds : trees per category.
     leaves : maximum number of leaves per tree.

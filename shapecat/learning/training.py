@@ -129,7 +129,7 @@ def _notes_of(settings: LearningSettings) -> dict[str, Any]:
 def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) -> Categorizer:
     """Fit the temperature and the novelty threshold on held-out views.
 
-    The temperature stays 1 if less than half of the categories have held-out views.
+    The temperature becomes 1 if fewer than half of the categories have held-out views.
 
     Parameters
     ----------

@@ -65,7 +65,10 @@ def assign(costs: F8, limit: float, method: Literal["hungarian", "greedy"]) -> I
 
 
 def _greedy(gain: F8) -> I4:
-    """Pair rows with columns of ``gain`` (m, n), smallest value first; return (p, 2), by row."""
+    """Pair rows and columns of ``gain`` (m, n), lowest value first; return (p, 2), by row.
+
+    All values are at most 0; those of 0 are not paired.
+    """
     rows, columns = np.nonzero(gain)
     free_row, free_column = np.ones(gain.shape[0], bool), np.ones(gain.shape[1], bool)
     pairs = []

@@ -1,4 +1,4 @@
-"""The output record of the tracker."""
+"""The record of a track."""
 
 from dataclasses import replace
 

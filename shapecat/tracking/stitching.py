@@ -124,7 +124,8 @@ def _contradiction(keys: F8, other_keys: F8, size_known: Bool, other_size_known:
 def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> Iterator[I4]:
     """Yield, for each fragment, later ones that start near its end position or soon after its end.
 
-    These are indices (k,). ``limit`` (f,) is the largest distance for each fragment, metres.
+    These are indices (k,) of fragments in the same scene. ``limit`` (f,) is the largest distance
+    from each end position, metres.
     """
     if len(limit) == 0:
         return
