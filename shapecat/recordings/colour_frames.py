@@ -165,7 +165,7 @@ class _Partner:
         self._left_out: Counter[str] = Counter()
 
     def take(self, message: Message) -> None:
-        """Decode a colour image and keep it for later frames."""
+        """Decode a colour image and keep it for later frames; count it if it is unreadable."""
         if message.type != self.stream.type:
             return
         try:
@@ -225,7 +225,7 @@ class _Partner:
         return [one for one in close if closest is None or one.setbacks == closest.setbacks]
 
     def view(self, frame: Frame) -> ColourView | None:
-        """Return the colour image nearest to a frame in time; None if none is usable."""
+        """Return the colour image of a frame; if none is usable, count the reason, return None."""
         candidates = self._candidates(frame)
         nearest = min(candidates, key=lambda one: abs(one.stamp_ns - frame.stamp_ns), default=None)
         if nearest is None:

@@ -83,7 +83,9 @@ def _motion(
 def _sensor_motion(
     buffer: TransformBuffer, fixed_frame: str, frame: Frame, fixed_from_sensor: Pose, end_ns: int
 ) -> Pose:
-    """Return the motion, as in `_motion`, of the depth sensor from the stamp of its frame.
+    """Return the motion of the depth sensor from the stamp of its frame to ``end_ns``.
+
+    The result is the pose at the first relative to the second, as in `_motion`.
 
     The axes of the data may differ from those of the frame that the message names.
     """

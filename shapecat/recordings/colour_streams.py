@@ -94,7 +94,8 @@ def pair_colours(
     Returns
     -------
     The colour stream of each depth topic that has one. If its ``info_topic`` is that of the depth
-    stream, it is replaced by None.
+    stream, it is replaced by None. If the recording has no colour stream, there is a warning for
+    each topic of colour that cannot be read.
 
     Raises
     ------

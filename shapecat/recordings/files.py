@@ -16,7 +16,7 @@ def is_of_bag(name: str) -> bool:
 
 
 def write_ahead_log(database: Path) -> Path | None:
-    """Return a database's write-ahead log if it has messages that the database lacks, else None."""
+    """Return the path of a database's write-ahead log; None if it is missing or empty."""
     log = database.with_name(f"{database.name}{_LOG}")
     there = os.path.isfile(log)  # noqa: PTH113  Path.is_file raises if the name is too long
     return log if there and log.stat().st_size else None

@@ -93,7 +93,8 @@ def frames(
 
     Yields
     ------
-    Frames by log time. Their ``index`` counts the messages of their stream, from 0 at ``start_s``.
+    Frames in the order of their messages, except that a depth image waits for its calibration.
+    Their ``index`` counts the messages of their stream, from 0 at ``start_s``.
     """
     if skipped is None:
         skipped = Counter()

@@ -20,6 +20,8 @@ def lens_content(
 ) -> dict[str, Any]:
     """Return the content of a `Frame`: depth and pinhole camera, or points if no camera fits.
 
+    A distortion that is unknown or cannot be inverted is ignored, with a warning.
+
     Parameters
     ----------
     info : a decoded CameraInfo.

@@ -142,7 +142,7 @@ class DepthSource(FrameSource):
     def calibrate(self, message: Message) -> Iterator[Frame]:
         """Store a calibration; yield the frame of the image that waited for it, if any.
 
-        One without intrinsics does not replace an earlier one.
+        One without intrinsics does not replace an earlier one; an unreadable one causes a warning.
         """
         try:
             info = self.recording.decode(message)

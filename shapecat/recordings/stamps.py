@@ -45,7 +45,7 @@ class Estimates:
         self._delays: dict[str, int] = {}
 
     def stamp_ns(self, topic: str, log_time_ns: int) -> int:
-        """Return an estimate of the stamp of a message, nanoseconds."""
+        """Return an estimate of a message's stamp, ns; the log time if no stamp was found."""
         if topic not in self._delays:
             self._delays[topic] = next(self._delays_of(topic), 0)
         return max(log_time_ns - self._delays[topic], 0)

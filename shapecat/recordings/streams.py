@@ -154,7 +154,7 @@ def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
 
 
 def _encoding_or_error(recording: Recording, topic: Topic) -> str:
-    """Return the encoding of a topic's images, or why none can be decoded; empty for others."""
+    """Return the encoding of a topic's images, or why no message can be decoded; else empty."""
     if ros_counterpart(topic.type) not in _PROBES:
         return ""
     reason = ""

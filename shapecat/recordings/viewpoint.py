@@ -31,7 +31,7 @@ def find_viewpoint(points: F4, previous: PinholeFit | None) -> tuple[PinholeFit,
     Returns
     -------
     The camera, ``frame_from_camera``, and the points (h, w, 3) in the frame of the camera; None if
-    no camera fits, or if the points do not determine one, as on a single plane.
+    no plausible camera fits, or if the points do not determine one, as on a single plane.
     """
     sample = sample_pixels(points, lambda flat: np.asarray((flat != 0).any(axis=1)))
     if sample is None:

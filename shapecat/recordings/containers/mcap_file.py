@@ -182,9 +182,9 @@ class McapRecording(ChunkedRecording):
             self._reported.add(record.offset)
 
     def _plain(self, record: Record, end: int | None) -> memoryview:
-        """Return the decompressed records of a chunk; verify its checksum the first time.
+        """Return the decompressed records of a chunk, at most ``end`` bytes; None for all.
 
-        ``end`` is the number of bytes that are needed; None for all.
+        A complete chunk that is read as a whole is verified the first time.
         """
         if end is not None or not record.whole:
             return read_chunk(self.content(record), end=sys.maxsize if end is None else end)

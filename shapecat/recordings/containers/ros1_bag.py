@@ -48,7 +48,12 @@ class BagRecording(ChunkedRecording):
         return self._expand(self._record_at(chunk.position), sum(chunk.entry.values()))
 
     def _read_header(self) -> dict[str, bytes]:
-        """Return the fields of the bag header; empty if it is damaged."""
+        """Return the fields of the bag header, empty if it is damaged; note where records begin.
+
+        Raises
+        ------
+        RecordingError : the file is not version 2.0, or is encrypted.
+        """
         self._first = len(MAGIC)
         self._file.seek(0)
         if self._file.read(len(MAGIC)) != MAGIC:

@@ -187,7 +187,10 @@ def _rows(image: ColourImage) -> U1:
 
 
 def _from_yuv(rows: U1, luma: int) -> U1:
-    """Convert YUV 4:2:2 (h, w, 2) to RGB with the JFIF matrix (ITU-R BT.601, full range)."""
+    """Convert YUV 4:2:2 (h, w, 2) to RGB with the JFIF matrix (ITU-R BT.601, full range).
+
+    ``luma`` is from `_LUMA`. An odd last column becomes black.
+    """
     height, width, _ = rows.shape
     y = rows[..., luma].astype(np.float32)
     chroma = rows[..., 1 - luma].astype(np.float32) - 128
@@ -200,7 +203,10 @@ def _from_yuv(rows: U1, luma: int) -> U1:
 
 
 def _from_bayer(mosaic: U1, red: int) -> U1:
-    """Demosaic a Bayer image (h, w): all pixels of a 2 x 2 block get the same colour."""
+    """Demosaic a Bayer image (h, w): all pixels of a 2 x 2 block get the same colour.
+
+    ``red`` is from `_BAYER`. An odd last row or column becomes black.
+    """
     height, width = (size // 2 * 2 for size in mosaic.shape)
     corner = [mosaic[k // 2 : height : 2, k % 2 : width : 2] for k in range(4)]
     green = [k for k in range(4) if k not in {red, 3 - red}]

@@ -78,7 +78,7 @@ class TransformBuffer:
         self._replaced: set[str] = set()
 
     def forget(self, stamp_ns: int) -> None:
-        """Remove the transforms before a stamp, except the last one of each frame."""
+        """Remove each frame's transforms before a stamp, except the last of these."""
         for track in self._tracks.values():
             track.forget(stamp_ns)
 
@@ -274,6 +274,8 @@ class TransformBuffer:
 
 def fixed_frame(buffer: TransformBuffer, frame_id: str, at_ns: int | None = None) -> str | None:
     """Choose the fixed frame for a sensor frame: map, odom, world, or the root of its tree.
+
+    If the sensor frame has a namespace, frames in other namespaces come last.
 
     Parameters
     ----------

@@ -32,7 +32,8 @@ class Extrinsics:
     """Looks up the transform from a depth sensor to a colour camera.
 
     Sources are, in this order: static transforms, all transforms, and librealsense's own messages
-    (``extrinsics/depth_to_color`` of its ROS driver, ``tf/N`` of its recorder).
+    (``extrinsics/depth_to_color`` of its ROS driver, ``tf/N`` of its recorder). Cameras with equal
+    frame ids coincide, except in recordings of that recorder, where only its messages count.
     """
 
     def __init__(self, recording: Recording, depth: Stream, colour: ColourStream) -> None:
@@ -73,7 +74,10 @@ class Extrinsics:
     def _lookup(
         self, buffer: TransformBuffer, depth_frame: str, colour_frame: str, stamp_ns: int
     ) -> Pose | None:
-        """Return ``colour_from_depth`` from ``buffer``; None if it is missing."""
+        """Return ``colour_from_depth`` from ``buffer``; None if it is missing.
+
+        If it is known only at other times, there is a warning.
+        """
         with suppress(TransformError):
             try:
                 return buffer.lookup(colour_frame, depth_frame, stamp_ns)

@@ -25,7 +25,8 @@ def transform_topics(recording: Recording, sensor_topics: Sequence[str] = ()) ->
     """Return the topics of a recording that hold transforms.
 
     If frames of the same name are on ``/r1/tf`` and ``/r2/tf``, the topic in the namespace of
-    ``sensor_topics`` is used, and the other robot's is left out. ``/tf`` is always used.
+    ``sensor_topics`` is used, and the other robot's is left out, with a warning. ``/tf`` is always
+    used.
     """
     topics = {t.name for t in recording.topics if ros_counterpart(t.type) in TF_TYPES}
     spaces = {topic: topic.strip("/").rpartition("/")[0] for topic in sorted(topics)}
