@@ -28,7 +28,7 @@ def read_frames(
 
     Raises
     ------
-    ConfigError : the options select no frames.
+    ConfigError : ``start_s``, ``end_s`` or ``every`` is invalid.
     NoStreamError : a topic is missing or not usable.
     """
     streams = choose_streams(recording, options["topics"])

@@ -142,7 +142,8 @@ def _read_streams(folder: Path, categories: int, placed: set[str]) -> Iterator[D
     """Yield the detections that are tracked together, numbered by their rows in the table.
 
     Those of all topics in ``placed`` are tracked together, in the fixed frame; those of any other
-    topic on their own, in its sensor frame. ``categories`` is the number of categories.
+    topic on their own, in its sensor frame. Detections without a position in this frame are left
+    out. ``categories`` is the number of categories.
     """
     streams: dict[str, TableBuilder] = {}
     count = 0

@@ -39,7 +39,8 @@ __all__ = [
 
 PREVIOUS = "tracks.previous.csv"
 LOST = "tracks.previous-*.csv"
-"""Names of replaced tables with labels that could not be transferred. Later runs keep them."""
+"""Pattern for the names of replaced tables with labels that could not be transferred. Later runs
+keep these tables."""
 _MOST_PROBLEMS = 20
 """Maximum number of problems of a table in an error message."""
 

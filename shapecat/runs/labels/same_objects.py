@@ -43,7 +43,10 @@ Group = Callable[[int], int]
 
 
 class Match(NamedTuple):
-    """A track of the target, and the distance of its centre from the source track, metres."""
+    """A track of the target, and the distance of its centre from the source track, metres.
+
+    The distance is a mean over the frames in which they match, if they were matched in time.
+    """
 
     track: int
     distance_m: float
@@ -95,7 +98,8 @@ def _by_majority(
     """Match each track of the target with the source object that it matches in most frames.
 
     ``votes`` counts, for each pair of source and target track, the frames in which they match, and
-    ``apart`` sums their distances, metres; ``counts`` counts the frames of each target track.
+    ``apart`` sums their distances, metres; ``counts`` counts the frames of each target track. All
+    are frames that both runs have.
     """
     matches_of: dict[int, list[Match]] = {}
     reasons: dict[int, str] = {}
@@ -117,7 +121,7 @@ def _by_majority(
 
 
 def _widths(folder: Path, tracks: TrackDetections) -> F8:
-    """Return the width (n,) of the track of each detection, metres."""
+    """Return the width (n,), the larger horizontal size, of the track of each detection, metres."""
     extents = extents_of(folder, tracks)
     return np.array([extents[track][0] for track in tracks.tracks.tolist()])
 

@@ -46,9 +46,9 @@ def explain_transform_clocks(
 ) -> Iterator[str]:
     """Yield a warning for each sensor whose clock is not that of the transforms that move it.
 
-    Their delays are compared at the same log times, since a simulation may be slower than the
-    recorder's clock. If several frames move the sensor, the one with the most similar delay counts:
-    localization may stamp its transforms with a time in the future.
+    The delays of images and transforms are compared at the same log times, since a simulation may
+    be slower than the recorder's clock. If several frames move the sensor, the one with the most
+    similar delay counts: localization may stamp its transforms with a time in the future.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ _SHIFT_M = 0.01
 """Masks are displaced if objects move farther than this between the two images."""
 _UNEXPLAINED = 0.5
 """Poses explain the motion of objects relative to the camera if this fraction of it exceeds their
-motion in the fixed frame. They never seem at rest there, since their visible sides change."""
+motion in the fixed frame. No object seems at rest there, since its visible sides change."""
 _MIN_MOTIONS = 3
 """Minimum number of comparisons on which the speed of objects is based."""
 

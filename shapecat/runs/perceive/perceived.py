@@ -170,7 +170,10 @@ def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]], *, again: bool) 
 
 
 def _pose_columns(name: str, poses: Sequence[Pose | None]) -> dict[str, Any]:
-    """Return the columns of translations (3,) and rotations (9,), row by row; None if unknown."""
+    """Return the columns of translations (3,) and rotations (9,), row by row; None if unknown.
+
+    Their names begin with ``name``.
+    """
     return {
         f"{name}_translation": [pose and pose.translation for pose in poses],
         f"{name}_rotation": [pose and pose.rotation.ravel() for pose in poses],

@@ -60,7 +60,7 @@ class Work(NamedTuple):
 def perceive_all(work: Work) -> None:
     """Perceive every frame in constant memory; write frames, detections, planes and masks.
 
-    The counts, the up direction and the warnings are stored in ``work.run``.
+    The counts, the fixed frame, the up direction and the warnings are stored in ``work.run``.
 
     Raises
     ------

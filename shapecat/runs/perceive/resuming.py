@@ -25,7 +25,8 @@ _LATER = ("tracking.", "outputs.")
 def require_resumable(job: Job, planned: RunInfo, digest: Callable[[], str]) -> None:
     """Refuse a job that would discard an interrupted run of other input, model or settings.
 
-    Runs of other versions, or of a recording that has changed since, may be discarded.
+    Runs of other versions, or of a recording that has changed since, may be discarded; so may any
+    run if the job is to overwrite results.
 
     Parameters
     ----------
@@ -146,7 +147,7 @@ def _perception_differences(run: RunInfo, planned: RunInfo) -> dict[str, str]:
 
 
 def _result_differences(run: RunInfo, planned: RunInfo) -> dict[str, str]:
-    """Return the `differences` of two runs besides which outputs they have."""
+    """Return the `differences` of two runs, except in which outputs were requested."""
     found = differences(run, planned).items()
     return {name: text for name, text in found if name not in OUTPUT_OPTIONS}
 

@@ -31,7 +31,7 @@ _AGREES_DEG = 5.0
 _STILL_SHARE = 0.6
 """The camera is at rest if more than this fraction of the nearby frames agree."""
 _STILL_DEG = 3.0
-"""Largest angle between the up directions of frames that agree."""
+"""Largest angle between the up directions of frames that agree and their median."""
 _FIXED_SHARE = 0.5
 """Up is known in the fixed frame if more than this fraction of frames agree within `_OFF_DEG`."""
 _AROUND = 30
@@ -124,7 +124,7 @@ def _fixed_up(stream: _Stream, posed: Bool) -> F8:
 def _still_up(stream: _Stream) -> F8:
     """Return, for each frame, the up direction (n, 3) on which the nearby frames agree.
 
-    It is NaN if they do not agree, since the camera moved.
+    It is NaN if they are too few, or do not agree, since the camera moved.
     """
     has_plane, expected = stream.has_plane, np.full(stream.up.shape, np.nan)
     for k in range(len(expected)):
@@ -162,8 +162,8 @@ def _lacks_usual_support(stream: _Stream, off: Bool) -> Bool:
 def _agreed(up: F8, within_deg: float, share: float) -> F8:
     """Return the direction (3,) on which more than ``share`` of the directions agree.
 
-    ``up`` (n, 3) are the directions; two agree if they differ by at most ``within_deg``. The result
-    is NaN if too few agree.
+    ``up`` (n, 3) are the directions. Those less than ``within_deg`` from their median agree, and
+    the result is the mean of these; NaN if they are too few, or there are fewer than `_FEWEST`.
     """
     if len(up) < _FEWEST:
         return np.full(3, np.nan)

@@ -72,7 +72,8 @@ class UpCheck:
     def _look(self, frame: Frame, orientation: Orientation) -> None:
         """Compare the up direction of a frame with its planes.
 
-        After enough frames, decide whether the topic has the right up direction.
+        After enough frames, decide whether the topic has the right up direction. At the first, warn
+        if its clouds are not in the frame of a camera.
         """
         self._looks[frame.topic] += 1
         hint, off = orientation.up, self._off_deg.get(frame.topic, [])

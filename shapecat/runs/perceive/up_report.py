@@ -37,7 +37,9 @@ def report_up(poses: PoseFinder, folder: Path) -> dict[str, Any]:
 
 
 def explain_up(poses: PoseFinder, folder: Path, report: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a warning for failed look-ups, gaps, contradictions, their consequences, and wrong up.
+    """Yield warnings about the transforms, unknown poses, and an up direction off the planes.
+
+    The problems of transforms are failed look-ups, gaps, and contradictions at equal stamps.
 
     Parameters
     ----------

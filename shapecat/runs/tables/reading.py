@@ -242,7 +242,7 @@ def opened(
     Parameters
     ----------
     columns : the columns to check; by default all of the table's schema.
-    read_dictionary : columns to read as dictionaries.
+    read_dictionary : columns that stay dictionary-encoded.
 
     Raises
     ------
