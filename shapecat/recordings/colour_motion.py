@@ -70,11 +70,11 @@ def view_at_its_time(
 def _motion(
     buffer: TransformBuffer, fixed_frame: str, frame_id: str, start_ns: int, end_ns: int
 ) -> Pose:
-    """Return the pose of a frame at the first stamp relative to itself at the second.
+    """Return the pose of the frame ``frame_id`` at ``start_ns`` relative to itself at ``end_ns``.
 
     Raises
     ------
-    TransformError : the pose of the frame in the fixed frame is unknown at one of them.
+    TransformError : the pose of the frame in the fixed frame is unknown at one of these stamps.
     """
     start, end = (buffer.lookup(fixed_frame, frame_id, ns) for ns in (start_ns, end_ns))
     return compose(inverse(end), start)
@@ -85,9 +85,8 @@ def _sensor_motion(
 ) -> Pose:
     """Return the motion of the depth sensor from the stamp of its frame to ``end_ns``.
 
-    The result is the pose at the first relative to the second, as in `_motion`.
-
-    The axes of the data may differ from those of the frame that the message names.
+    The result is as in `_motion`, but in the axes of the data, which may differ from those of the
+    frame that the message names.
     """
     named_from_sensor = compose(
         inverse(buffer.lookup(fixed_frame, frame.frame_id, frame.stamp_ns)), fixed_from_sensor

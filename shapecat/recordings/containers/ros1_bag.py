@@ -125,7 +125,7 @@ class BagRecording(ChunkedRecording):
     def _records(self) -> Iterator[Record]:
         """Yield the records in file order; a truncated one is cut to its readable part.
 
-        After a damaged record, reading continues at the next chunk in the index.
+        After a damaged record, reading continues at the next chunk in the index, with a warning.
         """
         for start, end in pairwise([self._first, *self._places, self._size]):
             try:

@@ -78,7 +78,8 @@ class DatabaseRecording(Recording):
     def _with_log(self) -> Path:
         """Return the database, or a copy that includes the write-ahead log of a killed recorder.
 
-        The copy and its log use at most half of the free space of the temporary folder.
+        The copy and its log use at most half of the free space of the temporary folder. If that is
+        not possible, the log is ignored. There is a warning in both cases.
         """
         log = write_ahead_log(self.path)
         if log is None:
@@ -136,7 +137,8 @@ class DatabaseRecording(Recording):
     ) -> Iterator[tuple[int, Any, Any]]:
         """Yield channel id, time (ns) and data of each message; the data is None if damaged.
 
-        ``times`` are start and stop, nanoseconds; None for no limit.
+        ``times`` are start and stop, nanoseconds; None for no limit. If no more rows can be read,
+        the rows end with a warning.
         """
         count = 0
         try:
@@ -156,7 +158,7 @@ class DatabaseRecording(Recording):
     ) -> Iterator[tuple[int, int, Any]]:
         """Yield rows as `_rows` does, but read the data of each with a query of its own.
 
-        The first ``done`` rows are left out.
+        The first ``done`` rows are left out. ``numbers`` are the ids of the channels.
         """
         start, stop = times
         given = ",".join("?" * len(numbers))

@@ -85,7 +85,12 @@ class FolderRecording(Recording):
         self._note()
 
     def _list_files(self) -> list[Path]:
-        """Return the files of the bag; warn about missing ones, and those not in metadata.yaml."""
+        """Return the files of the bag; warn about missing ones, and those not in metadata.yaml.
+
+        Raises
+        ------
+        RecordingError : there is none.
+        """
         files = [file for file in sorted(self.path.iterdir()) if file.is_file()]
         present = [file for file in files if _suffix(file) in _PARTS]
         in_metadata = self._listed_names()

@@ -240,7 +240,10 @@ class TransformBuffer:
         return track[max(0, at - 1)].parent
 
     def _chain(self, frames: list[str], stamp_ns: int) -> Pose:
-        """Return the transform from the first frame to the parent of the last."""
+        """Return the transform from the first frame to the parent of the last, at a stamp (ns).
+
+        Each of the ``frames`` is followed by its parent.
+        """
         pose = IDENTITY
         for frame_id in frames:
             pose = compose(self._to_parent(frame_id, stamp_ns), pose)

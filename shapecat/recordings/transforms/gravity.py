@@ -201,7 +201,7 @@ class PoseFinder:
         return Orientation(source, None if up is None else turned(up, turn), pose)
 
     def assume_misnamed(self, topic: str, misnaming: Misnaming) -> None:
-        """Treat the data on a topic as misnamed from now on."""
+        """Treat the data on a topic as misnamed from now on; add a warning."""
         self.misnamed[topic] = misnaming.named_from_data
         self.warnings.append(f"{topic}: {misnaming.text}; its transforms are corrected")
 
