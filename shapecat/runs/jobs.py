@@ -188,7 +188,7 @@ def differences(run: RunInfo, planned: Mapping[str, Any]) -> dict[str, str]:
 
 
 def describe_differences(differing: Mapping[str, str]) -> str:
-    """Describe the `differences` of a run, and perhaps of its input, for an error message."""
+    """Describe the `differences` of two runs, and perhaps of their inputs, for an error message."""
     listed = "; ".join(f"{name}: {text}" for name, text in differing.items())
     return f"another input, model or settings ({listed})"
 

@@ -168,7 +168,11 @@ def _boxes(
     *,
     visible: bool,
 ) -> Iterator[tuple[AnnotationBox, ...]]:
-    """Yield the boxes of each frame, sensor frame; ``ups`` (n, 3) are the frames' up directions."""
+    """Yield the boxes of each frame, sensor frame.
+
+    ``keys`` are n frames, ``ups`` (n, 3) their up directions, and ``detections`` their rows of the
+    table. ``visible`` is as in `read_annotation_frames`.
+    """
     all_rows, places = frame_rows(detections), _places(detections)
     spans = [tracks.frames.get(key, _NO_ROWS) for key in keys]
     of_frames = [all_rows.get(key, _NO_ROWS) for key in keys]

@@ -204,7 +204,10 @@ def _pose_finder(work: Work, fixed_frame: str | None) -> PoseFinder:
 
 
 def _oriented(work: Work, poses: PoseFinder, skipped: Counter[str]) -> Iterator[Oriented]:
-    """Yield the frames of a run with their orientations, once the up directions are decided."""
+    """Yield the frames of a run with their orientations, once the up directions are decided.
+
+    ``skipped`` counts the unreadable frames by reason.
+    """
     source = (_placed(poses, *reading) for reading in _readings(work, skipped))
     for frame, colour, orientation in UpCheck(poses, work.job.settings).before(source):
         yield frame, colour, poses.corrected(frame.topic, orientation)
