@@ -219,6 +219,8 @@ def track(folder: Path, run: RunInfo, job: Job) -> None:
 def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer = ignore) -> None:
     """Write review.rrd and annotated.mcap, as far as requested and not yet written.
 
+    ``run`` gets their durations, and the warnings of the recording.
+
     Raises
     ------
     OutputError : a file cannot be written, or tracks.csv is invalid.

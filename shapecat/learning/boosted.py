@@ -88,6 +88,7 @@ def _boost(
     """Grow one tree per category in each round; return them round by round.
 
     The leaf values of all trees are added to ``scores`` (k, n), the logits of the n views.
+    ``labels``, ``rounds`` and ``jobs`` are as for `grow_ensemble`.
     """
     truth = labels == np.arange(len(scores))[:, None]
     # Only K - 1 of K logits are independent: each moves (K - 1) / K as far (Friedman 2001, eq. 36).

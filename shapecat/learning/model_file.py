@@ -131,7 +131,7 @@ def _read(source: Traversable, name: str) -> Categorizer:
 
 
 class _NotAModelError(Exception):
-    """The file is not a model."""
+    """The content of a file is not a model, is damaged, or is of another version."""
 
 
 def _parse(content: bytes) -> Categorizer:

@@ -234,8 +234,9 @@ def _by_time(topics: I4, stamps_ns: I4) -> Any:
 def _times_set_back(stamps_ns: I4) -> I4:
     """Return the number of times that a clock was set back up to each frame, (f,).
 
-    Single wrong stamps do not count: the two frames before must both be later than this one and
-    the next, by more than `_SET_BACK_NS`.
+    ``stamps_ns`` (f,) are those of a topic, in the order of recording. Single wrong stamps do not
+    count: the two frames before must both be later than this one and the next, by more than
+    `_SET_BACK_NS`.
     """
     # A jump after the first stamp or before the last one cannot be confirmed, and does not count.
     ends = ((stamps_ns.min(), stamps_ns.max()),)
