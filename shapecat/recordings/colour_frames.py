@@ -225,7 +225,7 @@ class _Partner:
         return [one for one in close if closest is None or one.setbacks == closest.setbacks]
 
     def view(self, frame: Frame) -> ColourView | None:
-        """Return the colour image of a frame; if none is usable, count the reason, return None."""
+        """Return a frame's colour image; if none is usable, count the reason and return None."""
         candidates = self._candidates(frame)
         nearest = min(candidates, key=lambda one: abs(one.stamp_ns - frame.stamp_ns), default=None)
         if nearest is None:

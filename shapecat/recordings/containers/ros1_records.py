@@ -47,7 +47,8 @@ _RATIO = 1000
 class BagError(RecordingError):
     """A record is damaged, or extends beyond the end of the file or chunk.
 
-    ``record`` is the readable part of a truncated record; None if its header is not readable.
+    ``record`` is the readable part of a truncated record of the file, if its header is readable;
+    otherwise None.
     """
 
     def __init__(self, message: str, record: "Record | None" = None) -> None:

@@ -158,7 +158,7 @@ def pose_of(sample: TransformSample) -> Pose:
 
 
 def are_close(a: TransformSample, b: TransformSample) -> bool:
-    """Return whether two samples differ by less than `_MOVED_M` and `_TURNED`."""
+    """Return whether two samples of one parent differ by less than `_MOVED_M` and `_TURNED`."""
     cosine = abs(sum(p * q for p, q in zip(a.quaternion, b.quaternion, strict=True)))
     return (
         a.parent == b.parent

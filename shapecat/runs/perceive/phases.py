@@ -109,10 +109,10 @@ def _explain_poses(work: Work, poses: PoseFinder) -> Iterator[str]:
 
 
 def revise(work: Work) -> None:
-    """Perceive again the frames that disagree with the rest, and rewrite the tables.
+    """Perceive again frames without a plane, or that disagree with the rest; rewrite the tables.
 
     An up direction that the user gave is never revised. A frame keeps its first result if it shows
-    neither a plane nor an object with the new up direction.
+    neither a plane nor an object with the new up direction. The counts in ``work.run`` are updated.
     """
     folder, run = work.folder, work.run
     chosen = frames_to_revise(read_segments(folder)) if run["up"]["source"] != "option" else {}
