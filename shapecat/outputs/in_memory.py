@@ -79,6 +79,8 @@ def _points(values: np.ndarray, masked: Bool) -> F4:
 def _depth(values: np.ndarray, masked: Bool) -> F4:
     """Return a depth image (h, w) in metres, 0 where it is masked or not measured.
 
+    ``values`` are metres, or millimetres if they are integers.
+
     Raises
     ------
     ConfigError : the shape or the type is wrong, or the unit is not metres.

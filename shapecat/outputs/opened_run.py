@@ -77,7 +77,7 @@ class Table:
             raise OutputError(msg) from error
 
     def pandas(self, columns: str | Iterable[str] | None = None) -> Any:
-        """Read the table, or some columns, as a pandas data frame; as `arrow`, but needs pandas."""
+        """Read the table, or some columns, like `arrow`, but as a data frame; requires pandas."""
         return self.arrow(columns).to_pandas()
 
     def numpy(self, column: str) -> Any:

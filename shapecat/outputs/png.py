@@ -48,7 +48,7 @@ def png(
 
 
 def with_palette(image: bytes, palette: U1) -> bytes:
-    """Return a PNG made by `png` with another palette (k, 3); k must be the same."""
+    """Return a copy of a PNG from `png` with another palette (k, 3) of the same length."""
     chunk = _chunk(b"PLTE", np.ascontiguousarray(palette, np.uint8).tobytes())
     start = image.index(b"PLTE") - 4  # a chunk starts with its length
     return image[:start] + chunk + image[start + len(chunk) :]

@@ -112,7 +112,7 @@ def _rows(
 
 
 def _topic(folder: Path, frame: int, topic: str | None) -> str:
-    """Return the topic that has the frame.
+    """Return the only topic that has the frame; if ``topic`` is not None, search no other.
 
     Raises
     ------

@@ -176,7 +176,8 @@ def _annotations(frames: Iterable[AnnotationFrame]) -> Iterator[Annotation]:
 def _with_periods(frames: Iterable[AnnotationFrame]) -> Iterator[tuple[AnnotationFrame, int]]:
     """Yield each frame with the time to the next frame of its topic, ns.
 
-    If that is not among the next `_AHEAD` frames, the time since the previous one is used.
+    If that is not among the next `_AHEAD` frames, it is the time since the previous one, or else
+    `_PERIOD_NS`.
     """
     source = iter(frames)
     following = deque(islice(source, _AHEAD))
@@ -200,7 +201,7 @@ def _period(frame: AnnotationFrame, following: AnnotationFrame) -> int:
 
 
 def _encoding(recording: Recording, first: Annotation | None) -> str:
-    """Return the encoding for annotations: the annotated topic's, or else the most common one.
+    """Return the encoding for annotations: that of the first frame's topic, or the most common.
 
     It is CDR for a ROS 1 bag, which is converted to ROS 2, and JSON if none is supported.
     """

@@ -39,7 +39,7 @@ class ImageBox(NamedTuple):
 
 
 class ImageFrame(NamedTuple):
-    """An image and the objects on it."""
+    """An image and the objects in it."""
 
     topic: str
     stamp_ns: int
@@ -51,7 +51,8 @@ class ImageFrame(NamedTuple):
 def read_image_frames(folder: Path, tracks: LabelledTracks) -> Iterator[ImageFrame]:
     """Yield each colour image of a run once, with the objects of the frame nearest to it in time.
 
-    Images of a single row, the colours of unorganized clouds, are left out.
+    Objects without a mask on the image are left out, and so are images of a single row, the colours
+    of unorganized clouds.
     """
     for key, masks in read_nearest_masks(folder):
         if masks.height <= 1:

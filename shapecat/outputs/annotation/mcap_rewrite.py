@@ -20,7 +20,7 @@ from shapecat.recordings.decoding.decoders import LIBRARY_ERRORS, schema_of
 __all__ = ["rewrite"]
 
 _Registered = tuple[int, Callable[[bytes | memoryview], memoryview] | None]
-"""The number of a channel in the written file, and the function that converts its messages."""
+"""The number of a channel in the written file, and the converter of its messages, or None."""
 
 
 def rewrite(

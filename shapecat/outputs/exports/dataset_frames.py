@@ -46,7 +46,8 @@ class ImageSelection:
     every : take every n-th frame of a stream.
     per_track : largest number of views to choose per track, as different as possible; only frames
         with a chosen view are taken. 0 takes all frames.
-    min_confidence : objects with a lower confidence are not used for training.
+    min_confidence : objects with a lower confidence are not used for training, unless a person
+        labelled their track.
     corrected_only : whether only objects with a label from a person are used for training.
     depth : whether the images are depth images in millimetres instead of colour images.
     val : fraction of the recordings for the validation split, from 0 to below 1.
@@ -62,7 +63,7 @@ class ImageSelection:
 
 @dataclass(frozen=True)
 class DatasetImage:
-    """An image of a data set, and the objects on it.
+    """An image of a data set, and the objects in it.
 
     ``name`` is the file name with suffix, ``contents`` the content of the file.
     """
@@ -177,7 +178,12 @@ def _image(
     selection: ImageSelection,
     corrected: set[int],
 ) -> DatasetImage | None:
-    """Return the image of a frame, named ``name`` with a suffix; None if the frame has no image."""
+    """Return the image of a frame, named ``name`` with a suffix; None if the frame has no image.
+
+    Raises
+    ------
+    MessageError : the image is damaged.
+    """
     image = _depth_file(labelled, frame) if selection.depth else _colour_file(frame, coloured)
     if image is None:
         return None
@@ -269,8 +275,8 @@ def thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFra
 def _view_features(labelled: LabelledFrame, item: LabelledObject) -> F8:
     """Return features (8,) of a view, scaled so that their differences are comparable.
 
-    They are the direction to the sensor (3), the logarithms of distance and number of pixels, and
-    the relative lengths of the box (3).
+    They are the direction to the sensor (3), in the fixed frame if there is a pose; the logarithms
+    of distance and number of pixels; and the relative lengths of the box (3).
     """
     pose, center = labelled.fixed_from_sensor, np.asarray(item.box.center, np.float64)
     distance = float(np.linalg.norm(center))

@@ -55,7 +55,7 @@ class Exported:
     Attributes
     ----------
     objects : number of objects labelled for training, summed over all images.
-    uncertain : number of visible objects without a reliable label, summed in the same way.
+    uncertain : the same for visible objects without a reliable label, except unknown ones.
     images : number of images in each split.
     """
 
@@ -89,8 +89,8 @@ def export_run(
     """Export the labels of a finished run with their points.
 
     Crops are added to the data set ``out``. The other formats are written to ``out/NAME``, where
-    NAME is the name of the run folder; only an earlier export is replaced. If the run has a fixed
-    frame, frames without a pose in it are left out: their objects have no tracks and no labels.
+    NAME is the name of the run folder; only an earlier export is replaced. Frames without a pose in
+    the fixed frame are left out if most frames of their topic have one: they have no tracks.
 
     Parameters
     ----------
@@ -107,8 +107,8 @@ def export_run(
 
     Raises
     ------
-    OutputError : the content of the recording has changed, or ``out`` is not writable, is a run,
-        or holds something else.
+    OutputError : the content of the recording has changed, the format cannot hold the labels, or
+        ``out`` is not writable, is a run, or holds something else.
     RecordingError : the recording is missing or unreadable.
     """
     _require_no_run(out)
@@ -154,8 +154,8 @@ def export_dataset(
 
     Raises
     ------
-    OutputError : a run has no images, no image can be exported, the content of a recording has
-        changed, or ``out`` is not writable, is a run, or holds something else.
+    OutputError : a run has no images, no image can be exported, a category has two spellings, a
+        recording has changed, or ``out`` is not writable, is a run, or holds something else.
     RecordingError : a recording is missing or unreadable.
     """
     _require_no_run(out)
@@ -242,7 +242,7 @@ def _staged(target: Path, about: Mapping[str, Any], write: Callable[[Path], int]
 
 
 def _mark(folder: Path, about: Mapping[str, Any]) -> None:
-    """Write export.json, which marks an export: its description ``about``, and the names in it."""
+    """Write export.json, which marks an export: ``about``, and the names in the folder."""
     names = sorted(path.name for path in folder.iterdir() if path.name != _MARK)
     with replacing(folder / _MARK) as path:
         path.write_text(json.dumps({**about, "made": names}, indent=1) + "\n", "utf-8")
@@ -272,7 +272,7 @@ def _made_by_export(folder: Path) -> Collection[str] | None:
 
 
 def _tracked(frames: Iterable[LabelledFrame], placed: Collection[str]) -> Iterator[LabelledFrame]:
-    """Yield the images, except those without a pose on topics that need one (``placed``)."""
+    """Yield the frames, except those without a pose on topics that need one (``placed``)."""
     return (f for f in frames if f.fixed_from_sensor is not None or f.topic not in placed)
 
 

@@ -79,7 +79,7 @@ def _require_distinct_types(categories: Iterable[str]) -> None:
 def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
     """Return the rotation (3, 3) from the sensor to a level camera: x right, y down, z forward.
 
-    If the sensor looks straight down or up, the top of its image points forward.
+    If the sensor looks almost straight down or up, the top of its image points forward.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
 
 
 class _View(NamedTuple):
-    """The camera of 2D boxes and ``P2`` (None for clouds), and its pose ``camera_from_sensor``."""
+    """The camera of 2D boxes and ``P2`` (None without an image), and ``camera_from_sensor``."""
 
     camera: Camera | None
     pose: Pose

@@ -31,8 +31,9 @@ def write_point_labels(out: Path, frames: Iterable[PairedFrame], finished: Finis
     """Write the labels of all points; return the number of objects.
 
     Depth images give depth/ (millimetres), semantic/ and instance/ as 16-bit PNG. Clouds give
-    velodyne/ (x, y, z and 0 for each point with depth, sensor frame) and labels/. Files are
-    numbered; frames.csv lists the topic, frame and camera of each number.
+    velodyne/ (x, y, z and 0 for each point with depth, sensor frame), labels/ and
+    semantic-kitti.yaml. Files are numbered; frames.csv lists the topic, frame and camera of each
+    number.
 
     Raises
     ------

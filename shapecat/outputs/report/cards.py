@@ -150,7 +150,8 @@ def _facts(card: Card) -> list[str]:
 def _bars(line: Timeline, categories: Sequence[str], row: TrackRow, names: Sequence[str]) -> str:
     """Return a button for each category, the most likely first, with a bar for its posterior.
 
-    ``categories`` and ``names`` are as in `card_html`.
+    ``categories`` and ``names`` are as in `card_html`. If the track has a category that is not in
+    ``categories``, its button is the last one.
     """
     shares = dict(zip(categories, line.fused.tolist(), strict=False))
     order = sorted(shares, key=lambda name: -shares[name])
@@ -175,7 +176,7 @@ def _bar(name: str, share: float, digit: str) -> str:
 
 
 def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
-    """Return an SVG plot of the causal posterior, with the times of detection below it.
+    """Return an SVG plot of the highest causal posteriors, with the times of detection below.
 
     It is empty if ``end`` is 0, as for a single frame.
     """

@@ -283,7 +283,7 @@ def _border_share(mask: Mask, height: int, width: int) -> float:
 
 
 def _detail(image: FramePicture, mask: Mask) -> float:
-    """Return the standard deviation of the Laplacian within an object's crop, grey levels."""
+    """Return the standard deviation of the Laplacian inside an object, in its crop, grey levels."""
     window = _window(image, mask)
     grey = np.asarray(_cut(image, window).convert("L"), np.float32)
     inside = _inside(mask.full(*image.shape), window, grey.shape)

@@ -154,7 +154,7 @@ def _nearest(spots: F8) -> F8:
 
 
 def _closed(nearness: F8) -> F8:
-    """Fill the empty pixels that the object mostly surrounds with the mean of their neighbours.
+    """Fill empty pixels, if the object mostly surrounds them, with the mean of their neighbours.
 
     ``nearness`` (h, w) is from `_nearest`; empty pixels are -inf.
     """
@@ -167,7 +167,7 @@ def _closed(nearness: F8) -> F8:
 
 
 def _smoothed(heights: F8, bare: Bool) -> F8:
-    """Average each pixel (h, w), even the empty ones in ``bare``, with those on the object."""
+    """Average each pixel (h, w), even an empty one (``bare``), with those nearby on the object."""
     weight: F8 = (~bare).astype(np.float64)
     value: F8 = np.where(bare, 0.0, heights)
     for _ in range(_PASSES):

@@ -260,9 +260,10 @@ def _link(start: Path, target: Path) -> str:
 
 
 def _faces(cards: Sequence[Card], labels: Mapping[int, TrackLabel]) -> tuple[str, ...]:
-    """Return pictures, data URIs, of the most certain object of each category, then of others.
+    """Return up to `_FACES` pictures: the most certain object of each category, then others.
 
-    ``labels`` are the final labels. Of merged tracks, the one that keeps its number is preferred.
+    Pictures are data URIs, ``labels`` the final labels. Of merged tracks, the one that keeps its
+    number is preferred.
     """
     pictures: dict[TrackLabel, str] = {}
     shown = [card for card in cards if card.pictures and card.row.track in labels]

@@ -97,7 +97,10 @@ def _shaded(
 
 
 def _radius(frame: Frame, points: F4, step: int) -> float:
-    """Return the radius, metres, at which points ``step`` pixels apart nearly touch."""
+    """Return the radius, metres, at which points ``step`` pixels apart nearly touch.
+
+    For an unorganized cloud, it is constant.
+    """
     if frame.camera is None:
         return _RADIUS_M
     middle = float(np.median(points[::16, 2])) if len(points) else 0.0
@@ -137,7 +140,8 @@ def _colours(points: F4, light: F4, tones: U2, palette: U1, planes: F4, plane_to
     ----------
     points : (n, 3) metres, sensor frame.
     light : (n,) brightness factors.
-    tones : (n,) indices into the palette; points of index 0 get the colour of a plane nearby.
+    tones : (n,) indices into the palette; points of index 0 get the colour of a plane
+        nearby, if there is one.
     palette : (k, 3); the last ``plane_tones`` entries are for planes, in turn.
     planes : (p, 8), from `_plane_rows`.
     """

@@ -52,7 +52,7 @@ def true_colours(
 
 @kernel
 def _hide(projected: F4, shape: tuple[int, int], cell: float, share: float) -> None:
-    """Set the column of points to NaN if they are outside of the image or occluded.
+    """Set the column of points to NaN if they are outside the image or occluded.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ def open_viewer(path: Path) -> None:
 
     Raises
     ------
-    OutputError : the file, the viewer or a display is missing.
+    OutputError : the file, the viewer or a display is missing, or the viewer fails.
     """
     _require_file(path)
     if sys.platform == "linux" and not any(os.environ.get(name) for name in _DISPLAYS):
@@ -61,7 +61,7 @@ def serve_viewer(path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
 
     Raises
     ------
-    OutputError : the file or the viewer is missing, or the viewer ends immediately.
+    OutputError : the file or the viewer is missing, or the viewer ends or does not answer.
     """
     _require_file(path)
     web, data = _free_port(), _free_port()
