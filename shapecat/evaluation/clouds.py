@@ -103,7 +103,10 @@ def _content(path: Path) -> bytes:
 
 
 def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], _Layout]:
-    """Return the other words of each header line by its first word, and the body's layout."""
+    """Return the words of each header line by its keyword, and the layout of the body.
+
+    Raise ValueError, as `_ply_header` and `_unpack_pcd` do, if the content is invalid.
+    """
     found = re.search(rb"^DATA +(\w+)\s*?\n", content[:_LARGEST_HEADER], re.MULTILINE)
     if not found:
         msg = "it has no line DATA"

@@ -117,7 +117,7 @@ def _views_among(root: Path, pattern: str) -> list[Path]:
 def read_view(path: Path) -> View:
     """Read one view; its folders name the category and the instance.
 
-    If the file does not state the position of the sensor, `guess_eye` estimates it.
+    If the file states no valid position of the sensor, `guess_eye` estimates it.
 
     Raises
     ------

@@ -38,7 +38,8 @@ def evaluate_folder(
     Raises
     ------
     RecordingError : there are no views, one cannot be read, a folder has an invalid name, there are
-        too few views to train on, or the training set of the baselines holds a view of ``root``.
+        too few views to train or test on, or the training set of the baselines holds a view of
+        ``root``.
     ModelError : the model is unusable, or does not know a category of the data set.
     """
     categorizer = load_model(model)
@@ -80,7 +81,7 @@ def _require_other_views(test: Dataset, root: Path, training_set: Path) -> None:
 
     Raises
     ------
-    RecordingError : a view is.
+    RecordingError : a view is in both.
     """
     sizes = {path.stat().st_size for path in test.files}
     files = (path for path in sorted(training_set.rglob("*")) if path.is_file())

@@ -168,7 +168,8 @@ def _describe_folder(
 ) -> tuple[DescribedViews, list[str]]:
     """Describe a data set from which a model with the ``known`` categories will learn.
 
-    Return the described views, and the sorted names of the category folders without any.
+    Return the described views, and the sorted names of the category folders without any. Raise
+    `ModelError` if there are too many categories.
     """
     dataset = read_dataset(root)
     require_category_names(root, dataset.categories, known)

@@ -56,7 +56,7 @@ class Comparison:
     run, reference : their paths.
     kind : kind of the reference, in words.
     figures : metrics by name, as plain values; None if they cannot be computed.
-    rows : one for each object of each compared frame.
+    rows : one for each true object and each unmatched detection of each compared frame.
     pictures : the frames that differ most, in the order of the run.
     notes : remarks for the reader.
     """
@@ -93,7 +93,8 @@ def compare(
     Raises
     ------
     OutputError : the folder is not a complete run, or the reference is a run of another recording.
-    RecordingError : the reference cannot be read, or has no frame in common with the run.
+    RecordingError : the reference cannot be read, is for images of another size, or has no frame in
+        common with the run; or ``recording`` cannot be opened.
     """
     finished = read_complete(folder)
     other = open_reference(
@@ -171,7 +172,10 @@ def _doubts(rows: Sequence[Difference], reference: Path) -> list[str]:
 
 
 def _categories_left_out(tally: Tally, categories: Sequence[str]) -> list[str]:
-    """Return a list with a note if the model lacks the true category of any matched object."""
+    """Return a list with a note if the model lacks the category of any matched true object.
+
+    *unknown* does not count.
+    """
     others = [pair.truth for pair in tally.pairs if pair.truth not in (*categories, UNKNOWN)]
     if not others:
         return []
@@ -207,7 +211,7 @@ class _ComparedFrames:
     """
 
     def __init__(self, recorded_frames: Iterator[Frame]) -> None:
-        """Begin with the frames of the recording, of which the pictures show the depth."""
+        """Begin with the frames of the recording, whose depth the pictures show."""
         self.tally = Tally()
         self._recorded_frames = recorded_frames
         self._last_tracks: dict[int, int] = {}  # by true track, the track last matched with it

@@ -109,7 +109,7 @@ def _objects(rows: Sequence[Difference], overlap: Overlap | None) -> dict[str, A
 
 
 def _category(pairs: Sequence[Pair], categories: Sequence[str]) -> dict[str, Any]:
-    """Return the accuracies of final labels and single views, and the views' calibration error."""
+    """Return accuracies of final labels and of single views, the views' ECE, and the confusions."""
     wrong = Counter((pair.truth, pair.label) for pair in pairs if pair.truth != pair.label)
     truth = np.array([categories.index(pair.truth) for pair in pairs], np.int64)
     posteriors = np.array([pair.posterior for pair in pairs])
@@ -132,7 +132,7 @@ def _accuracy(pairs: Sequence[tuple[str, str]]) -> float | None:
 
 
 def _balanced(pairs: Sequence[tuple[str, str]]) -> float | None:
-    """Return the mean recall of the true categories; a pair is the true and the given category."""
+    """Return the mean recall of the true categories in (true, given) pairs; None without pairs."""
     names = sorted({true for true, _ in pairs})
     recalls = [_accuracy([pair for pair in pairs if pair[0] == name]) for name in names]
     return _mean([value for value in recalls if value is not None])

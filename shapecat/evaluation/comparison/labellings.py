@@ -120,7 +120,7 @@ class Reference(ABC, Generic[_Frame]):
         self._index = self._indexed(entries)
 
     def _indexed(self, entries: list[tuple[Place, _Frame]]) -> dict[Place, _Frame]:
-        """Return the entries by place.
+        """Return the entries by place; raise `RecordingError` if two have the same place.
 
         A frame is found by its timestamp alone, unless other frames of its topic have the same one:
         then its number is needed, too.

@@ -91,8 +91,8 @@ def frame_identities(
 ) -> FrameIdentities:
     """Return the identities of a frame, without duplicates, and their similarity.
 
-    ``matched`` is from `match_objects`. Of several detections of one track, the one most similar to
-    a true object counts.
+    Objects without a track are left out. Of several detections of one track, the one most similar
+    to a true object counts. ``matched`` is from `match_objects`.
     """
     best: dict[int, int] = {}
     for i, item in enumerate(found):

@@ -83,7 +83,7 @@ class Matched(NamedTuple):
 def match_masks(found: Sequence[U4], true: Sequence[U4]) -> Matched:
     """Match found and true masks one to one, maximising the sum of overlap F.
 
-    Each mask is the flat indices (n,) of its pixels.
+    Each mask is the flat indices (n,) of its pixels. Pairs may have no pixel in common.
 
     Source: Xie et al. 2020 (overlap F of unseen objects), after Ochs et al. 2014.
     """

@@ -245,6 +245,10 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
     A detection without a track keeps its own category. Detections of deleted tracks are left out;
     those of merged tracks are joined if they are in the same frame. Boxes are full boxes if these
     are known, else visible ones.
+
+    Raises
+    ------
+    OutputError : the tables are damaged or do not fit together.
     """
     folder = finished.folder
     deleted = _deleted(folder, finished.labels)
@@ -273,7 +277,7 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
 
 
 def _deleted(folder: Path, labels: Container[int]) -> set[tuple[str, int, int]]:
-    """Return topic, frame and number of each detection whose track a person has deleted."""
+    """Return topic, frame, number of each detection of a deleted track, one not in ``labels``."""
     names = ("topic", "frame", "detection", "track")
     deleted = set()
     for group in read_row_groups(folder / "tracks.parquet", names):
@@ -292,7 +296,7 @@ def _item(
 
     ``label`` is its track, category and confidence; ``rows`` are the detections' rows in the table,
     ``full`` their full boxes, None if unknown; ``up`` (3,) is the up direction. The largest
-    detection gives ``view_category``.
+    detection gives ``view_category``; ``posterior`` is the mean of all detections.
     """
     track, category, confidence = label
     boxes = [

@@ -45,7 +45,7 @@ class _Image(NamedTuple):
 
 
 class CocoLabels(Reference[_Image]):
-    """Masks of a COCO file, as polygons or run lengths.
+    """Masks of a COCO file, as polygons or run lengths; ``iscrowd`` makes the category undecidable.
 
     An image names its frame by ``stamp_ns`` (with ``frame`` where stamps repeat), by ``frame``, or
     by a number in its ``file_name``: a timestamp in nanoseconds, else the last number, which is
@@ -142,7 +142,12 @@ def _is_numbered(image: Mapping[str, Any]) -> bool:
 
 
 def _number_in_name(image: Mapping[str, Any]) -> int:
-    """Return the timestamp (ns), or else the frame number, in the file name of an image."""
+    """Return the timestamp (ns), or else the frame number, in the file name of an image.
+
+    Raises
+    ------
+    ValueError : the name holds no number.
+    """
     digits = re.findall(r"\d+", Path(image["file_name"]).stem)
     if not digits:
         msg = f"the name {image['file_name']!r} holds neither a timestamp nor a frame number"
