@@ -153,7 +153,7 @@ def _has_bag_metadata(folder: Path) -> bool:
 
 
 def _follow_in_time(paths: Sequence[Path]) -> bool:
-    """Return whether each recording begins at most 10 s after the end of the one before it.
+    """Return whether each recording begins 0 to 10 s after the end of the one before it.
 
     Unreadable recordings, and those without messages, are ignored; at least two must be left.
     """

@@ -45,7 +45,7 @@ class Ledger:
         self._in_progress: dict[str, Entry] = {}
 
     def record_planned(self, tasks: Iterable[Task]) -> None:
-        """List the recordings to process in the manifest, except those already listed."""
+        """List in the manifest the recordings to process, except those already listed."""
         entries = (task.entry() for task in tasks if task.status != "complete")
         new = (entry for entry in entries if not self._is_recorded(entry, "planned"))
         while some := list(islice(new, _MOST_LINES)):

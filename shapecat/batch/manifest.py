@@ -183,7 +183,7 @@ class RemoteManifest(Manifest):
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Send the remaining lines, and all entries as one file."""
+        """Send the remaining lines, and all entries as one file if lines were sent; log errors."""
         self._ended.set()
         self._thread.join()
         try:
@@ -207,7 +207,7 @@ class RemoteManifest(Manifest):
         return self._summary.read() or b""
 
     def _keep_latest(self, lines: Iterable[bytes]) -> None:
-        """Keep the later of two entries, since several writers may work at the same time."""
+        """Keep the latest entry of each run folder: several writers may work at the same time."""
         for entry in _entries(lines):
             last = self.entries.get(entry.folder)
             if last is None or last.time <= entry.time:

@@ -30,7 +30,7 @@ def name_folders(
     """Return a unique run folder name for each recording: its file name without suffix.
 
     If several recordings have the same name, the name of the parent folder is put in front of it;
-    if that name is taken, too, a number is added.
+    if the resulting name is taken, a number is added.
 
     Parameters
     ----------

@@ -136,8 +136,8 @@ def plan_batch(
 ) -> Iterator[Batch]:
     """Plan a task for each recording; keep the manifest open during the block.
 
-    Only numbered files in a folder without metadata are opened: their times decide whether they are
-    parts of one bag or separate recordings.
+    Of the recordings, only numbered files in a folder without metadata are opened: their times
+    decide whether they are parts of one bag or separate recordings.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def plan_batch(
 class _Planner:
     """Determines the status of each recording.
 
-    ``listing`` are the names in the folder of results, ``entries`` those of the manifest.
+    ``listing`` are the names in the folder of results, ``entries`` the manifest's entries by name.
     """
 
     def __init__(self, job: Job, out: str, listing: set[str], entries: Mapping[str, Entry]) -> None:

@@ -140,7 +140,7 @@ class Location:
         return self._error(f"{self.url}: cannot be {participle}: {reason}")
 
     def info(self) -> Mapping[str, Any] | None:
-        """Return size, times and digest of a file, as fsspec names them; None if it is missing."""
+        """Return what fsspec knows about a file or folder (type, size, times); None if missing."""
         with suppress(FileNotFoundError):
             info: Mapping[str, Any] = self._retry("read", lambda: self._system.info(self._path))
             return info
@@ -173,7 +173,7 @@ class Location:
         self._put("uploaded", lambda: self._system.put_file(str(file), self._path, **options))
 
     def _in_parts(self, size: int = 0) -> dict[str, int]:
-        """Return options that limit the memory to send ``size`` bytes; S3's default is 0.5 GB."""
+        """Return options that limit the memory to transfer ``size`` bytes; S3 would use 0.5 GB."""
         part = max(_PART_BYTES, -(-size // _MOST_PARTS))
         return {"chunksize": part, "max_concurrency": 2} if self._is_s3() else {}
 
@@ -215,7 +215,7 @@ class Location:
             raise self._error(msg)
 
     def copy(self, other: "Location") -> None:
-        """Copy a file within the storage."""
+        """Copy the file to ``other``, which must be in the same storage."""
         other._put("written", lambda: self._system.cp_file(self._path, other._path))  # noqa: SLF001  of this class
 
     def remove(self) -> None:
@@ -259,7 +259,7 @@ class Location:
             yield from self._retry("listed", lambda: system.ls(path, detail=True))
 
     def _list_pages(self, *, deep: bool) -> Iterator[Mapping[str, Any]]:
-        """Yield the info of each file in an S3 folder, page by page: a bucket may hold millions."""
+        """Yield the infos of a folder in S3 for `walk`, by pages: a bucket may hold millions."""
         bucket, key, _ = self._system.split_path(self._path)
         prefix = f"{key.rstrip('/')}/" if key else ""
         delimiter = "" if deep else "/"
@@ -297,7 +297,7 @@ class Location:
 
 
 def _connect(url: str, error: type[ShapecatError]) -> tuple[Any, str]:
-    """Return the fsspec file system of a URL, and the path in it."""
+    """Return the fsspec file system of a URL, and the path in it; errors are as for `Location`."""
     try:
         from fsspec.core import url_to_fs  # noqa: PLC0415  an extra
     except ImportError as missing:
