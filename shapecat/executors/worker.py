@@ -27,7 +27,7 @@ _SPAWN = get_context("spawn")
 
 
 class WorkerLostError(RuntimeError):
-    """The process that worked on a task died: killed, out of memory, or crashed."""
+    """The process for a task died (killed, out of memory, crashed), or could not be started."""
 
 
 class Call(NamedTuple):
@@ -147,7 +147,12 @@ def _receive(connection: socket.socket) -> Any:
 
 
 def _read(connection: socket.socket, size: int) -> bytearray:
-    """Read ``size`` bytes, usually in one call, which waits without the interpreter lock."""
+    """Read ``size`` bytes, usually in one call, which waits without the interpreter lock.
+
+    Raises
+    ------
+    EOFError, OSError : the other process is gone.
+    """
     content = bytearray(size)
     rest = memoryview(content)
     while rest:

@@ -112,6 +112,10 @@ def complete_folder(folder: Path) -> Iterator[Path]:
     """Provide a hidden folder; rename it to ``folder`` if the block succeeds.
 
     If not, the hidden folder is left behind, and the next call deletes it first.
+
+    Raises
+    ------
+    OSError : the folder cannot be written, or exists and is not empty.
     """
     hidden = partial_path(folder)
     shutil.rmtree(hidden, ignore_errors=True)
