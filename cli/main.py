@@ -28,7 +28,7 @@ from .view import view
 
 
 class _Commands(click.Group):
-    """Print known errors as one line and use their exit codes; other exceptions are bugs."""
+    """Prints known errors as one line and uses their exit codes; other exceptions are bugs."""
 
     def invoke(self, ctx: click.Context) -> Any:
         try:

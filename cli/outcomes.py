@@ -54,7 +54,7 @@ class Outcomes:
 
 
 def print_closing(tasks: Sequence["Task"], tally: Outcomes) -> None:
-    """Print the complete recordings, if at most 100, then the transferred labels and the totals."""
+    """Print complete recordings (if at most 100), transferred labels, and totals (if several)."""
     complete = tally.in_order(tasks)
     if 0 < tally.complete <= _MOST_ROWS:
         columns = ("recording", "frames", "seconds", "tracks", "results")

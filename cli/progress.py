@@ -134,7 +134,7 @@ class Progress:
             self.show_ended(outcome)
 
     def remaining_s(self) -> float | None:
-        """Return the estimated seconds left, from the bytes done so far; None if there are none.
+        """Return the estimated seconds left, from the bytes done so far; None before any are done.
 
         The time for loading and compiling, before the first frame, is excluded.
         """
@@ -227,7 +227,7 @@ class JsonProgress(Progress):
         _event("note", text=text)
 
     def show(self, folder: str) -> None:
-        """Write the progress of a recording, at most twice a second."""
+        """Write a recording's progress at most twice a second, and as a phase begins or ends."""
         phase, done, total = self.running[folder]
         before, now = self._last.get(folder, ("", 0.0)), time.monotonic()
         if phase != before[0] or now - before[1] >= _EVENT_S or done == total:

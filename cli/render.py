@@ -108,7 +108,7 @@ def for_any_reader() -> Iterator[None]:
 
 
 def discard_stdout() -> None:
-    """Discard the buffered output that stdout could not write."""
+    """Discard the buffered output that stdout could not write, and all further output."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
@@ -122,7 +122,7 @@ def note_off_support(categories: Sequence[str]) -> None:
 def note_skipped(learned: Mapping[str, Any]) -> None:
     """Report on stderr the defective views in the data set of `train` or `learn`.
 
-    These are the number of skipped views, the folders without a usable view, and the categories
+    It names the number of skipped views, the folders without a usable view, and the categories
     whose views mostly do not stand at z = 0. ``learned`` is the result of `train_on_folder` or
     `learn_on_folder`.
     """
