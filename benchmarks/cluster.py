@@ -58,7 +58,7 @@ class Assumed:
 
 @dataclass(frozen=True)
 class Measured:
-    """Costs in seconds, measured on this machine: of a frame, a task, a manifest line, a plan."""
+    """Seconds per frame, task, manifest line and planned recording, measured on this machine."""
 
     frame_s: float
     task_s: float
@@ -145,7 +145,7 @@ def _task_s(executor: Executor, count: int) -> float:
 
 
 def measure(frame_s: float) -> Measured:
-    """Measure the costs of the shared resources, with Dask workers."""
+    """Measure the costs of the shared resources, with one Dask worker; ``frame_s`` is given."""
     with tempfile.TemporaryDirectory() as folder:
         manifest = FileManifest(Path(folder) / "manifest.jsonl")
         entry = Entry("kitchen_0123", "/data/2024/kitchen_0123.mcap", "running", "0" * 16, "1" * 16)

@@ -29,7 +29,7 @@ HEAD = ("distance, m", "frames", "objects", "found", "mean F", "surplus a frame"
 
 
 def evaluate(world: World, sensor: Sensor, range_m: tuple[float, float], seed: int) -> Counts:
-    """Detect objects from a random direction and count them."""
+    """Detect objects from a random direction and distance, and count them."""
     rng = np.random.default_rng(seed)
     view = random_viewpoint(world, sensor, rng, distance_m=range_m)
     frame, labels = render_frame(world, view, rng=rng, sensor=sensor)

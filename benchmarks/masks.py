@@ -105,7 +105,7 @@ def _evaluate_run(folder: Path) -> Iterator[tuple[bool, tuple[float, float]]]:
 
 
 def _masks(folder: Path) -> Iterator[tuple[int, dict[int, tuple[Any, Any]]]]:
-    """Yield each frame's number and the two masks of each of its detections."""
+    """Yield each frame's number, and the two masks of each object by its detection number."""
     run = read_run(folder / "run")
     labels = read_labels(folder / "run" / "tracks.csv", run["model"]["categories"])
     labelled = read_labelled_frames(folder / "run", labels)

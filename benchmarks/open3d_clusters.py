@@ -17,7 +17,8 @@ def cluster_above_plane(cloud: Any, up: Array) -> tuple[Array, Array]:
 
     Returns
     -------
-    The indices (k,) of the points above the plane, and the cluster (k,) of each, -1 for noise.
+    The indices (k,) of the points 1 to 60 cm above the plane, and the cluster (k,) of each, -1 for
+    noise; none without a plane.
     """
     import open3d as o3d  # noqa: PLC0415  heavy; may lack its system libraries
 

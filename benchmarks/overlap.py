@@ -22,7 +22,7 @@ def labelled_sets(count: int, first_seed: int) -> dict[str, list[Labelled]]:
 
 
 def objects_in(frame: Frame) -> list[Array]:
-    """Find objects by detection."""
+    """Find objects with shapecat's detection; a `Finder`."""
     return [candidate.indices for candidate in detected(frame).candidates]
 
 

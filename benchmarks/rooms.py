@@ -32,8 +32,8 @@ class Counts(NamedTuple):
     ----------
     elsewhere : number of detections on no object.
     pieces : number of detections of an object in addition to its best one.
-    objects, found : number of true objects, and of those found.
-    f : sum of the overlap F of all objects, 0 for missed ones.
+    objects, found : number of true objects with at least `SEEN_PIXELS` pixels, and of those found.
+    f : sum of the overlap F of these objects, 0 for missed ones.
     """
 
     frames: int

@@ -73,6 +73,7 @@ class View:
     truth : true category.
     undecidable : as in `Object`.
     partial : whether the image border or another object cuts off the view.
+    posterior : (c,) of the single view.
     single, final : category of the single view, and final category of the track.
     """
 
@@ -210,7 +211,7 @@ def identities(seen: dict[str, list[FrameIdentities]]) -> dict[str, dict[str, fl
 
 
 def label_errors(views: Iterable[View]) -> dict[str, float]:
-    """Return the error rates of single views and of the final labels of their tracks."""
+    """Return the number of views, the error rates of single views and final labels, their ratio."""
     pairs = np.array([(v.single != v.truth, v.final != v.truth) for v in views]).reshape(-1, 2)
     single, final = pairs.sum(axis=0).tolist()
     return {

@@ -28,7 +28,7 @@ SEEN_PLANE_PIXELS = 3000
 """Planes with fewer depth pixels on their upper face are not expected to be found."""
 SAME_HEIGHT_M = 0.03
 FACE_M = 0.004
-"""Points this near to the height of a board count as its upper face."""
+"""Points nearer than this to the height of a support, metres, count as its upper face."""
 COLUMNS = (
     "objects", "recall", "precision", "planes, scenes", "relations", "empty scenes with objects"
 )  # fmt: skip
@@ -82,7 +82,7 @@ def _views(kind: SceneKind, first: int, count: int) -> Iterator[View]:
 
 
 def _matches(view: View, total: Counter[str]) -> dict[int, int]:
-    """Match candidates and objects one to one, and count objects, hits and detections.
+    """Match candidates and objects one to one; count objects, hits and detections in ``total``.
 
     Returns the index of the candidate that found each object, by the object's label.
     """

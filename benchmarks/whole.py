@@ -69,7 +69,7 @@ def standing(frames: int, *, objects: int = 8) -> list[View]:
 
 
 def write(path: Path, views: list[View], frames: int, *, container: str = "mcap") -> Path:
-    """Write a recording with ``frames`` frames; ``path`` gets the suffix of the format."""
+    """Write ``frames`` frames, back and forth through the views; ``path`` gets the right suffix."""
     suffix, kind = CONTAINERS[container]
     path = path.with_name(path.name.removesuffix(suffix) + suffix)
     to_and_fro = cycle([*views, *views[-2:0:-1]])
