@@ -957,7 +957,7 @@ def test_by_place_transfers_labels_of_another_run(
 
 
 def test_transfer_to_table_without_the_matched_track_names_it(tmp_path: Path) -> None:
-    """A line that a spreadsheet lost must not end in a traceback, with all outputs marked as old."""
+    """A line that a spreadsheet lost must not end in a traceback, with all outputs outdated."""
     table = tmp_path / "table.csv"
     write_csv(table, {4: static(CUP)}, "wfar", {4: "mug"})
     target = second(tmp_path / "target", {2: static(CUP)})
