@@ -96,7 +96,7 @@ def _clusters(frame: Frame) -> list[Array]:
 @click.option("--first", default=500, show_default=True, help="Seed of the first scene.")
 @click.option("--count", default=30, show_default=True, help="Number of simulated scenes.")
 def main(*, first: int, count: int) -> None:
-    """Print a table."""
+    """Score detection without each of the steps, and print a table."""
     print(run(count, first))
 
 

@@ -65,7 +65,7 @@ def measure(folder: Path, frames: int, turns: int) -> tuple[Any, ...]:
 )
 @click.option("--turns", default=9, help="Number of repetitions.")
 def main(*, frames: tuple[int, ...], turns: int) -> None:
-    """Print a table."""
+    """Time `annotate` and a copy of recordings of ``frames`` frames; print the medians."""
     with tempfile.TemporaryDirectory() as folder:
         rows = [measure(Path(folder), count, turns) for count in frames]
     print(markdown("Annotating again", ("frames", "MB", "annotate s", "cp s", "ratio"), rows))

@@ -74,7 +74,7 @@ CHANGES: dict[str, Change] = {
 @click.option("--first", default=500, show_default=True, help="Seed of the first scene.")
 @click.option("--count", default=30, show_default=True, help="Number of simulated scenes.")
 def main(*, first: int, count: int) -> None:
-    """Print a table."""
+    """Score detection on disturbed images, and print a table."""
     sets = labelled_sets(count, first)
     whole = {name: score(frames, objects_in)["F"] for name, frames in sets.items()}
     rows: list[tuple[str, ...]] = [("as they are", *(f"{f:.4f}" for f in whole.values()))]

@@ -36,9 +36,9 @@ def annotate(
     """Apply corrected labels to the files of a run.
 
     Fill in the column `label` of RUN/tracks.csv in a spreadsheet, or correct tracks in the page
-    that `shapecat report` makes. A label is a category, a new name, `delete`, or `merge with N` for
-    the number N of another track. The labels are written to tracks.csv, annotated.mcap and
-    review.rrd.
+    that `shapecat report` makes. A label is a category, the name of a new category, `delete`, or
+    `merge with N` for the number N of another track. The labels are written to tracks.csv,
+    annotated.mcap and review.rrd.
 
     \b
     shapecat annotate results/lab --labels corrected.csv

@@ -97,8 +97,8 @@ def export(
     crops         points of each object, for `shapecat train` and `learn`
     kitti         3D detection: label_2, calib, velodyne, image_2
     labelcloud    3D boxes to edit by hand in the tool labelCloud
-    point-labels  3D segmentation: masks of depth images, or labels of points
-                  (SemanticKITTI) for clouds
+    point-labels  3D segmentation: masks if the run has depth images, labels of
+                  points (SemanticKITTI) if it has clouds
 
     \b
     shapecat export results/lab --format crops --out crops

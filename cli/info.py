@@ -19,7 +19,8 @@ from .render import print_json, print_table
 def info(ctx: click.Context, /, *, recordings: tuple[Path, ...], as_json: bool) -> None:
     """List the topics of recordings and the depth streams to process.
 
-    Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag, or a folder with recordings.
+    Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), or a folder
+    with recordings.
 
     \b
     shapecat info lab.mcap

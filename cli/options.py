@@ -62,10 +62,10 @@ array_option = click.option(
     "--json",
     "as_json",
     is_flag=True,
-    help="Print a JSON array with an entry for each recording without an error.",
+    help="Print a JSON array with an entry per recording; those that fail are left out.",
 )
 config_option = click.option(
-    "--config", type=ANY_PATH, help="TOML file with settings, listed in docs/reference.md."
+    "--config", type=ANY_PATH, help="TOML file with settings; docs/reference.md lists them."
 )
 set_option = click.option(
     "--set",

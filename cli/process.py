@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     type=click.IntRange(1),
     metavar="N",
     help="Number of processes; by default one per core. If there are fewer recordings than "
-    "processes, several processes share the frames of one.",
+    "processes, several processes share the frames of a recording.",
 )
 @choice_option(
     "--executor",
@@ -80,7 +80,8 @@ if TYPE_CHECKING:
 @click.option(
     "--shard",
     metavar="I/N",
-    help="Process only part I of N, for job arrays. I counts from 1 or from 0: part 0 is part N.",
+    help="Process only part I of N, for job arrays. I is 1 to N, or 0 to N-1: 0/N is the same "
+    "part as N/N.",
 )
 @choice_option(
     "--progress",
@@ -131,8 +132,8 @@ def process(
 
     Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a folder with
     recordings, or a URL. The results of lab.mcap go to OUT/lab: tables, annotated.mcap for
-    Foxglove, and review.rrd for Rerun. If recordings have the same name, that of their folder
-    is put in front, as in OUT/monday_lab; if names are still equal, a number is appended.
+    Foxglove, and review.rrd for Rerun. If recordings have the same name, the name of their
+    folder is put in front, as in OUT/monday_lab; if that is not enough, a number is appended.
     For several recordings, OUT/manifest.jsonl records the state of each. To resume after an
     interruption, run the same command again.
 

@@ -179,7 +179,7 @@ class PlainProgress(Progress):
         self.note(text)
 
     def show(self, folder: str) -> None:  # noqa: ARG002  the line is about all
-        """Write a line, if the previous one is at least five seconds old."""
+        """Write a line about all recordings, at most one in five seconds."""
         now = time.monotonic()
         if now - max(self._last, self.begun) < _LINE_S:
             return

@@ -1118,7 +1118,7 @@ INFO: Mapping[str, Any] = {"size": 7, "ETag": "e1", "mtime": 1.5}
 def test_content_key_changes_with_content_at_url(
     changes: Mapping[str, Any], *, other: bool
 ) -> None:
-    """Without a digest from the storage, the time of writing counts."""
+    """Size or ETag change the key, and the time of writing does only without an ETag."""
     first = {**INFO, "ETag": None} if "ETag" in changes and changes["ETag"] is None else INFO
     infos = (
         {k: v for k, v in info.items() if v is not None} for info in (first, {**INFO, **changes})

@@ -81,7 +81,7 @@ NAMES = ["cup", "can", "box"]
 
 
 def block(x: int, y: int, w: int, h: int) -> list[int]:
-    """Return the pixels of a rectangle in an image of 10 by 10."""
+    """Return the flat indices of a rectangle of pixels in an image of 10 by 10."""
     return [v * SIDE + u for v in range(y, y + h) for u in range(x, x + w)]
 
 
@@ -923,7 +923,7 @@ class NamedFrames(Reference[str]):
 
 
 def test_labels_of_frame_match_its_topic_and_stamp() -> None:
-    """Labels without a topic, or by frame number, count only if there are no better ones."""
+    """Stamps are preferred to frame numbers, then labels of the topic to those of any topic."""
     names = {(None, 5): "any", ("/d", 5): "own", ("/d", START): "stamp", (None, START): "old"}
     labels = NamedFrames(Path("x"), (((*place, None), name) for place, name in names.items()))
     asked = ((("/d", 5), START), (("/e", 5), START), (("/d", 5), 1), (("/e", 5), 1), (("/e", 6), 1))

@@ -125,7 +125,7 @@ def test_page_shows_current_labels(run: Path, drawn: RunReport) -> None:
 def test_page_of_table_saved_by_spreadsheet_has_the_values_of_the_run(
     run: Path, drawn: RunReport
 ) -> None:
-    """If a table was sorted, or lost columns, cards lost their order and facts about tracks."""
+    """Sorting the table or dropping columns must not change the order or the facts of cards."""
     whole = data_of(replace(drawn, folder=run).page())
     table = read_track_table(run / "tracks.csv")
     rows = sorted(table.rows, key=lambda row: row.track)

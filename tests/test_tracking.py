@@ -638,7 +638,7 @@ def test_objects_at_rest_or_moving_independently_have_no_common_motion() -> None
 
 
 def test_backward_clock_jump_is_scene_cut() -> None:
-    """Two sessions in one recording must not be joined by equal stamps."""
+    """Two sessions in one recording, the second with earlier stamps, must not share tracks."""
     stamps = [*range(100, 105), *range(50, 55)]
     frames = [frame(k, [0, 0, 0], stamp_ns=s * SECOND // 5) for k, s in enumerate(stamps)]
     assert scene_cuts(next(gather(frames)), SETTINGS).tolist() == [k == 5 for k in range(10)]

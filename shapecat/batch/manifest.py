@@ -183,7 +183,10 @@ class RemoteManifest(Manifest):
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Send the remaining lines, and all entries as one file if lines were sent; log errors."""
+        """Send the remaining lines; after sending any, write all entries of all writers as a file.
+
+        Errors are logged.
+        """
         self._ended.set()
         self._thread.join()
         try:

@@ -63,17 +63,17 @@ def name_folders(
 def existing_names(
     sources: Sequence[Source], out: str, listing: set[str], noted: Mapping[str, Entry]
 ) -> dict[int, str]:
-    """Map the index of each recording that already has a run folder to the folder's name.
+    """Return the names of the run folders that recordings already have, by index in ``sources``.
 
-    Without these names, a recording that is added to a batch later, or processed alone, would
-    change the name of another run, be it complete, interrupted or failed. A recording is left out
-    if its own name is in ``out`` and no other recording has it.
+    Without them, a recording that is added to a batch later, or processed alone, would get the
+    folder of another one, or rename it. Recordings are left out whose name is in ``out`` and unique
+    among ``sources``: their folder has that name.
 
     Parameters
     ----------
     out : folder or URL of the batch.
     listing : the names in ``out``.
-    noted : entries of the manifest in a folder; at a URL, the entries of all shards are read.
+    noted : entries of the manifest, by run folder. At a URL, those of all shards are read instead.
 
     Raises
     ------

@@ -13,7 +13,7 @@ GAP_NS = 500_000_000
 
 
 class Earlier(NamedTuple):
-    """An earlier frame, and the pose of the current sensor in the sensor frame of that frame.
+    """An earlier frame, and the current pose of the sensor relative to its pose then.
 
     The pose is None if it is not known; the sensor is then assumed not to have moved.
     """

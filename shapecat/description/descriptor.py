@@ -199,8 +199,8 @@ def _nearest_neurons(starts: I4) -> I4:
 def _own_units(neurons: F4) -> tuple[F4, F4, F8, float]:
     """Return the neurons relative to their mean, in units of the mean distance between them.
 
-    The result is the neurons (3, n), the distances (n, n) in this unit, the mean (3,) in metres,
-    and the unit in metres, which is 1 if all neurons coincide.
+    ``neurons`` (n, 3) are in metres. The result is the neurons (3, n) and their distances (n, n) in
+    this unit, the mean (3,) in metres, and the unit in metres, which is 1 if all neurons coincide.
     """
     count = neurons.shape[0]
     center = np.zeros(3)

@@ -133,8 +133,9 @@ class Densities:
 
 
 def _log_density(z: F8, kernels: F8, width: float) -> F8:
-    """Return the log (n,) of the mean Gaussian around kernels (k, d) at views (n, d).
+    """Return the log density (n,), at views ``z`` (n, d), of the mean of Gaussians.
 
+    They have their centres at ``kernels`` (k, d), and the standard deviation ``width``.
     The factor that is the same for every category is left out. A kernel that coincides with a view
     does not count: it probably is that view, and would make the densities of training views too
     high. The result is -inf if no kernel counts.

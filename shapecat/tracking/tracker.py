@@ -71,8 +71,8 @@ class Tracker:
     that a rolling object is followed through an occlusion while a standing one keeps its position.
 
     The result does not depend on the order of the detections in a frame: they are sorted by centre,
-    size, posterior and ``partial``, which also orders new tracks within a frame. Detections equal
-    in all of these are interchangeable.
+    size, posterior and ``partial``, and new tracks get their numbers in this order. Detections
+    equal in all of these are interchangeable.
     """
 
     def __init__(self, settings: TrackingSettings) -> None:

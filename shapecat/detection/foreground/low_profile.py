@@ -296,9 +296,9 @@ def _drop_error(
 def _is_flat(residual: F4, i: int, j: int) -> bool:
     """Return whether the surface is flat around the low cell in row ``i`` and column ``j``.
 
-    It is if the cells two rows or two columns away, within the image, are low too and have
-    residuals that differ from its own by at most `LOW.side`, unlike on the side of an object.
-    ``residual`` (rows, columns), 1/m, is from `measure_residual`.
+    On flat surface, unlike on the side of an object, the four cells two rows or columns away are
+    low too, and their residuals differ from its own by at most `LOW.side`; those outside the image
+    do not count. ``residual`` (rows, columns), 1/m, is from `measure_residual`, 0 if not low.
     """
     rows, columns = residual.shape
     value = residual[i, j]

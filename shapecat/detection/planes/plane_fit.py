@@ -65,7 +65,10 @@ def dot(a: F8, b: F8) -> float:
 
 @kernel
 def horizontal_plane(intrinsics: PinholeIntrinsics, up: F8, offset: float) -> F8:
-    """Return the plane ``up @ p == offset``, metres, sensor frame, as (a, b, c)."""
+    """Return the inverse depth of the plane ``up @ p == offset`` (metres, sensor frame).
+
+    The result (a, b, c) means ``a * j + b * i + c``, 1/m, at column j and row i.
+    """
     a, b = up[0] / intrinsics.fx, up[1] / intrinsics.fy
     return np.array(
         [a / offset, b / offset, (up[2] - a * intrinsics.cx - b * intrinsics.cy) / offset]

@@ -191,9 +191,10 @@ def _peaks(amount: F8, threshold: float) -> Iterator[tuple[float, float]]:
 
 @kernel
 def _count_by_height(points: OrientedPoints, up: F8) -> F8:
-    """Count the points at each height, (BINS,) lowest first, except those that face sideways.
+    """Count the points below the sensor by height, except those that face sideways.
 
-    ``up`` (3,) is a unit vector, sensor frame.
+    The result is (BINS,); a bin is `STRIPS.bin_m` high, and the last one ends at the sensor. ``up``
+    (3,) is a unit vector, sensor frame.
     """
     x, y, z = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
     xs, ys, zs = points.positions[0], points.positions[1], points.positions[2]

@@ -277,7 +277,7 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
 
 
 def _deleted(folder: Path, labels: Container[int]) -> set[tuple[str, int, int]]:
-    """Return topic, frame, number of each detection of a deleted track, one not in ``labels``."""
+    """Return (topic, frame, detection) of all detections of tracks that are not in ``labels``."""
     names = ("topic", "frame", "detection", "track")
     deleted = set()
     for group in read_row_groups(folder / "tracks.parquet", names):

@@ -45,7 +45,7 @@ def rewrite(
     writer.start(parts[0].profile if parts else "ros2", "shapecat")
     target = _Target(writer, convert=recording.kind == "ros1")
     for channel in recording.channels():
-        target.number(channel)
+        target.id_of(channel)
     numbers = [target.register(channel) for channel in channels]
     sequences: Counter[int] = Counter()
     streams: list[Iterable[Message | EncodedMessage]] = [recording.messages(), items]
@@ -75,7 +75,7 @@ class _Target:
     def write(self, message: Message) -> None:
         """Write a message, converted or wrapped if necessary."""
         channel = message.channel
-        number, convert = self.number(channel)
+        number, convert = self.id_of(channel)
         data: bytes | memoryview = message.data
         try:
             data = convert(data) if convert is not None else data
@@ -84,8 +84,8 @@ class _Target:
         times = (message.log_time_ns, bytes(data), message.publish_time_ns)
         self.writer.add_message(number, *times, message.sequence)
 
-    def number(self, channel: Channel) -> _Registered:
-        """Return the number of a channel, and the function that converts its messages, or None.
+    def id_of(self, channel: Channel) -> _Registered:
+        """Return the id of a channel in the new file, and the converter of its messages or None.
 
         A new channel is registered first.
         """
@@ -94,7 +94,7 @@ class _Target:
         return self.known[channel]
 
     def register(self, channel: AnnotationChannel) -> int:
-        """Register a channel and its schema; return the number of the channel."""
+        """Register a channel and its schema; return the id of the channel."""
         key = (channel.schema_name, channel.schema_encoding, channel.schema)
         if key not in self.schemas:
             self.schemas[key] = self.writer.register_schema(*key) if channel.schema_name else 0

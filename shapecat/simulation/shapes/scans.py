@@ -108,10 +108,10 @@ def _slice_area(corners: F8, z: float) -> float:
 
 
 def _hollow(points: F8, mesh: Mesh) -> float:
-    """Return how deep the central surface, seen from above, lies below the top.
+    """Return the depth of the middle below the top, relative to the largest absolute x or y.
 
-    ``points`` (n, 3) are the vertices of the mesh, turned. The depth is a median over the pixels,
-    divided by the largest absolute x or y.
+    The mesh is rendered from above; the depth is the median over the pixels in the middle of the
+    image, 0 if nothing is visible there. ``points`` (n, 3) are the vertices, turned.
     """
     turned = Mesh(points, mesh.triangles)
     distance = 40 * float(np.abs(points).max())
