@@ -162,7 +162,8 @@ class _Partner:
         self._steps: deque[int] = deque(maxlen=9)
         self._newest: int | None = None
         self._extrinsics = Extrinsics(recording, depth, colour)
-        self._left_out: Counter[str] = Counter()
+        self._without: Counter[str] = Counter()
+        self._unreadable: Counter[str] = Counter()
 
     def take(self, message: Message) -> None:
         """Decode a colour image and keep it for later frames; count it if it is unreadable."""
@@ -173,7 +174,7 @@ class _Partner:
             size = len(image.data)
             stamp = self._clock.check(stamp_ns(image.header), message.log_time_ns)
         except (RecordingError, *MALFORMED) as error:
-            self._left_out[reason_of(error, self.stream.topic)] += 1
+            self._unreadable[reason_of(error, self.stream.topic)] += 1
             return
         if self._newest is not None and stamp > self._newest:
             self._steps.append(stamp - self._newest)
@@ -194,7 +195,7 @@ class _Partner:
                 self._lens = _lens_of(info, self.stream.topic)
                 self._calibration = content
         except (RecordingError, *MALFORMED) as error:
-            self._left_out[f"CameraInfo: {reason_of(error, self.stream.topic)}"] += 1
+            self._unreadable[f"CameraInfo: {reason_of(error, self.stream.topic)}"] += 1
 
     def notice(self, frame: Frame) -> None:
         """Take note of a new frame, to detect that the clock was set back before it."""
@@ -229,18 +230,20 @@ class _Partner:
         candidates = self._candidates(frame)
         nearest = min(candidates, key=lambda one: abs(one.stamp_ns - frame.stamp_ns), default=None)
         if nearest is None:
-            self._left_out["no colour image near the time of the frame"] += 1
+            self._without["no colour image near the time of the frame"] += 1
             return None
         try:
             return self._view(frame, nearest)
         except (RecordingError, *MALFORMED) as error:
-            self._left_out[reason_of(error, self.stream.topic)] += 1
+            self._without[reason_of(error, self.stream.topic)] += 1
             return None
 
     def report(self) -> None:
-        """Add a warning with a count for each reason why frames have no colour image."""
-        for reason, count in self._left_out.items():
-            self._recording.warn(f"{self.stream.topic}: frames without colour ({count}×): {reason}")
+        """Add a warning with a count for each reason why messages or frames were left out."""
+        counts = {"unreadable messages": self._unreadable, "frames without colour": self._without}
+        for what, reasons in counts.items():
+            for reason, count in reasons.items():
+                self._recording.warn(f"{self.stream.topic}: {what} ({count}×): {reason}")
 
     def _too_much(self) -> bool:
         """Return whether the kept images take too much memory."""
