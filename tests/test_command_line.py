@@ -473,8 +473,9 @@ def test_index_of_others_is_kept(shapecat: Run, runs: Path) -> None:
 
 
 def test_path_of_moved_recording_can_be_given(
-    shapecat: Run, recording: Path, tmp_path: Path
+    shapecat: Run, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Even a relative path must be found by later commands, from any folder."""
     lab = tmp_path / "lab.mcap"
     lab.write_bytes(recording.read_bytes())
     shapecat("process", lab, "--out", tmp_path, "--no-rrd", "--jobs", 1)
@@ -492,7 +493,9 @@ def test_path_of_moved_recording_can_be_given(
     assert (wrong.exit_code, "another recording" in wrong.stderr) == (1, True)
     exported = shapecat("export", tmp_path / "lab", *crops, "--recording", lab)
     assert exported.exit_code == 0, exported.stderr
-    assert shapecat("annotate", tmp_path / "lab", "--recording", lab).exit_code == 0
+    monkeypatch.chdir(lab.parent)
+    assert shapecat("annotate", tmp_path / "lab", "--recording", lab.name).exit_code == 0
+    monkeypatch.chdir(tmp_path)
     assert shapecat("annotate", tmp_path / "lab").exit_code == 0  # the new path is stored
     known, stat = read_run(tmp_path / "lab")["input"], lab.stat()
     assert known["path"] == str(lab.resolve())

@@ -241,6 +241,18 @@ def test_message_of_a_failed_part_does_not_outlive_it(capfd: pytest.CaptureFixtu
     assert "after the frames in progress" in capfd.readouterr().err
 
 
+def test_ignored_signal_stays_ignored() -> None:
+    """In a background job, Ctrl+C is for the command in the foreground."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with stopping.handling_signals():
+            signal.raise_signal(signal.SIGINT)
+            assert not stopping.asked()
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_command_in_another_thread_keeps_a_stop_request() -> None:
     """If the command forgot the request at its end, the main thread would go on for hours."""
 
