@@ -24,18 +24,19 @@ from shapecat.system.garbage import collect_seldom
 from tests.browser import Browser
 
 LONGEST = (
-    *("test_report_serve", "test_remote", "test_stopping", "test_report", "test_batch", "test_api"),
-    *("test_odd", "test_command_line", "test_tracking", "test_exports_images"),
-    *("test_learning_default_model", "test_reuse"),
-    *("test_labelling_loop", "test_crash", "test_second_look", "test_packaging", "test_executors"),
-    *("test_simulation_worlds", "test_simulation_physics", "test_architecture", "test_docs_run"),
-    *("test_detection_stacks", "test_detection", "test_review", "test_pipeline"),
-    *("test_detection_shelf", "test_evaluation", "test_tracking_scenes", "test_depth_fusion"),
-    *("test_learning", "test_jit", "test_rehearsal", "test_exports_readback"),
+    *("test_report_serve", "test_remote", "test_report", "test_batch", "test_odd", "test_stopping"),
+    *("test_command_line", "test_second_look", "test_crash", "test_detection"),
+    *("test_simulation_worlds", "test_evaluation", "test_exports_images", "test_pipeline"),
+    *("test_review", "test_tracking", "test_resuming", "test_api", "test_labelling_loop"),
+    *("test_executors", "test_architecture", "test_exports", "test_label_transfer"),
+    *("test_colour_motion", "test_detection_stacks", "test_detection_shelf", "test_gravity"),
+    *("test_jit", "test_exports_readback", "test_reuse", "test_tracking_scenes"),
+    *("test_depth_fusion", "test_packaging", "test_rehearsal", "test_learning"),
 )
 """Test files by duration, longest first."""
 TOGETHER = {
     "test_report_serve": "test_report",  # a browser and pictures of a run
+    "test_report_counts": "test_report",
     "test_simulation_camera": "test_simulation_worlds",  # Open3D, which takes seconds to load
     "test_evaluation_dataset": "test_simulation_worlds",
 }

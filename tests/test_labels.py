@@ -864,6 +864,7 @@ def refusals(shapecat: Callable[..., Result], folder: Path, out: Path) -> dict[s
     return messages
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize("content", [None, b""])
 def test_missing_table_of_a_run_can_be_restored(
     guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result], content: bytes | None

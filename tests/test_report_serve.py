@@ -11,7 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
@@ -143,17 +143,19 @@ def test_keyboard_corrections_survive_restart_of_server(browser: Browser, long_r
     } == wanted
 
 
-@pytest.mark.slow
-def test_page_reports_corrections_lost_by_killed_server(
-    browser: Browser, served: Callable[..., Server], long_run: Path
+@pytest.mark.parametrize("killed", [False, pytest.param(True, marks=pytest.mark.many)])
+def test_page_reports_corrections_lost_by_stopped_server(
+    browser: Browser, served: Callable[..., Server], long_run: Path, *, killed: bool
 ) -> None:
     """Each correction must be on disk, or the page must report it and offer it in a table."""
-    server = served(long_run)
-    browser.open(server.address)
-    order = order_of(browser)
-    browser.press(*["d", "Right"] * 9)
-    os.kill(server.pid, signal.SIGKILL)  # while requests may be on their way
-    server.wait()
+    server = served(long_run) if killed else None
+    with nullcontext((server.address, "")) if server else serving(long_run) as (address, _):
+        browser.open(address)
+        order = order_of(browser)
+        browser.press(*["d", "Right"] * 9)
+        if server:
+            os.kill(server.pid, signal.SIGKILL)  # while requests may be on their way
+            server.wait()
     browser.press(*["d", "Right"] * 4)
     browser.wait("return document.getElementById('saved').textContent.includes('does not answer')")
     browser.wait("return !document.getElementById('download').hidden")

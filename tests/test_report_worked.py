@@ -394,6 +394,7 @@ def test_bars_have_the_confidence_of_the_table_if_the_clock_was_set_back(tmp_pat
     assert bars == ["90.0%", "10.0%"]
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_length_is_that_of_the_run(run: Path) -> None:
     """The last object may leave long before the end, and there may be none."""
     table = pq.read_table(run / "frames.parquet")
