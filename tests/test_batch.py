@@ -44,7 +44,7 @@ from tests.track_tables import untimed_table
 Run = Callable[..., Result]
 TABLES = ("frames", "detections", "planes", "tracks")
 NAMES = ("bag", "folder", "log")
-FRAMES = 16
+FRAMES = 10
 
 
 class Watcher:
@@ -195,6 +195,7 @@ def test_two_processes_give_same_tables(
     assert states(tmp_path) == ALL_DONE
 
 
+@pytest.mark.many  # the tests with `late_answers` check the same without starting processes
 @pytest.mark.usefixtures("all_awake")
 def test_processes_sharing_frames_give_same_tables(recordings: Path, tmp_path: Path) -> None:
     """Processes share blocks of frames; with blocks of two frames, both processes have some."""

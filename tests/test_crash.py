@@ -106,11 +106,20 @@ def survive_kills(recording: Path, out: Path, undisturbed: Path, moments: list[f
     return killed
 
 
-def test_killed_run_resumes(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "kills",
+    [
+        [("segments/000000", 0.0)],
+        pytest.param([("", 0.15), ("segments/000000", 0.0)], marks=pytest.mark.many),
+    ],
+)
+def test_killed_run_resumes(
+    recording: Path, undisturbed: Path, tmp_path: Path, kills: list[tuple[str, float]]
+) -> None:
     """Only frames of the unfinished segment are processed again, whatever an earlier kill left."""
-    partial = tmp_path / ".table.partial"
-    for begun, seconds in ((partial, 0.15), (partial / "segments" / "000000", 0.0)):
-        assert kill_after(command(recording, tmp_path), begun, seconds)
+    for begun, seconds in kills:
+        running = command(recording, tmp_path)
+        assert kill_after(running, tmp_path / ".table.partial" / begun, seconds)
     assert not (tmp_path / "table").exists()
 
     process(Job(recording, tmp_path / "table", rrd=False))

@@ -36,7 +36,7 @@ def job(coloured_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     folder = tmp_path / "out" / "table"
     shutil.copytree(coloured_run, folder)
     source = Path(read_run(folder)["input"]["path"])
-    return Job(source=source, folder=folder, overwrite=True)
+    return Job(source=source, folder=folder, overwrite=True, rrd=False)
 
 
 @pytest.fixture

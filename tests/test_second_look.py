@@ -1,5 +1,6 @@
 """Tests of perceiving disturbed frames again with the up direction of the whole recording."""
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -241,26 +242,40 @@ def test_up_requested_by_user_is_kept(tmp_path: Path, up: str) -> None:
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a recording, its run, and a copy of the run before the second look."""
     folder = tmp_path_factory.mktemp("spoilt")
-    run(
-        folder / "table.mcap",
-        items(moving=False, poses=False, disturbed=MANY),
-        settings=BLOCKS,
-    )
+
+    def copy(phase: str, _done: int, _total: int | None) -> None:
+        if phase == "revise" and not (folder / "perceived").exists():
+            shutil.copytree(folder / ".table.partial", folder / "perceived")
+
+    messages = items(moving=False, poses=False, disturbed=MANY)
+    process(job_in(folder, write(folder / "table.mcap", messages)), copy)
     return folder
 
 
+def job_in(folder: Path, recording: Path) -> Job:
+    return Job(recording, folder / "table", mcap=False, rrd=False, settings=BLOCKS)
+
+
+@pytest.fixture
+def job(source: Path, tmp_path: Path) -> Job:
+    """Return a job whose frames are perceived, but not yet revised."""
+    shutil.copytree(source / "perceived", tmp_path / ".table.partial")
+    return job_in(tmp_path, source / "table.mcap")
+
+
 @pytest.mark.usefixtures("late_answers")
-def test_second_look_does_not_depend_on_number_of_workers(source: Path, tmp_path: Path) -> None:
-    out = tmp_path / "table"
-    process(Job(source / "table.mcap", out, mcap=False, rrd=False, settings=BLOCKS), cores=2)
+def test_second_look_does_not_depend_on_number_of_workers(source: Path, job: Job) -> None:
+    process(job, cores=2)
 
-    assert revised(out) == [*MANY]
-    assert_same_tables(out, source / "table")
+    assert revised(job.folder) == [*MANY]
+    assert_same_tables(job.folder, source / "table")
 
 
-def test_interrupted_second_look_resumes_where_it_stopped(source: Path, tmp_path: Path) -> None:
-    job = Job(source / "table.mcap", tmp_path / "table", mcap=False, rrd=False, settings=BLOCKS)
+def test_interrupted_second_look_resumes_where_it_stopped(
+    source: Path, job: Job, tmp_path: Path
+) -> None:
 
     def stop(phase: str, done: int, _total: int | None) -> None:
         if (phase, done) == ("revise", 5):
@@ -280,10 +295,9 @@ def test_interrupted_second_look_resumes_where_it_stopped(source: Path, tmp_path
 
 
 def test_kill_between_revised_tables_is_repaired(
-    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    source: Path, job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Otherwise some tables would be revised and others not."""
-    job = Job(source / "table.mcap", tmp_path / "table", mcap=False, rrd=False, settings=BLOCKS)
 
     def die(*_args: object) -> int:
         (tmp_path / ".table.partial" / "planes.parquet").write_bytes(b"half")

@@ -189,7 +189,26 @@ def test_run_completes_if_progress_reader_leaves(recording: Path, tmp_path: Path
     assert (tmp_path / recording.stem / "tracks.csv").exists()
 
 
-@pytest.mark.parametrize("jobs", ["1", pytest.param("2", marks=pytest.mark.many)])
+def test_second_signal_ends_process_at_once(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It must not wait for the frames in progress, or say again that it waits for them."""
+    ended: list[int] = []
+    monkeypatch.setattr(os, "_exit", ended.append)
+    with stopping.handling_signals():
+        signal.raise_signal(signal.SIGINT)
+        assert ended == []
+        assert "interrupt again to stop immediately" in capfd.readouterr().err
+        monkeypatch.setattr(stopping, "request", None)
+        with suppress(TypeError):  # here, `os._exit` returns
+            signal.raise_signal(signal.SIGTERM)
+
+    assert ended == [143]
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.many
+@pytest.mark.parametrize("jobs", ["1", "2"])
 def test_second_signal_ends_command(
     recording: Path, undisturbed: Path, tmp_path: Path, jobs: str
 ) -> None:
