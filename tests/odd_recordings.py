@@ -29,7 +29,7 @@ from tests.mcap_files import McapChannels, mcap_writer
 from tests.messages import EPOCH, SECOND
 from tests.scenes import OPTICAL, PERIOD, back_and_forth, record, serialized, stream, views
 
-FRAMES = 4
+FRAMES = 2
 FACTORY, FACTORY1 = MessageFactory(2), MessageFactory(1)
 
 
@@ -55,12 +55,14 @@ def write_all(writer: Any, items: Iterable[tuple[str, str, int, bytes]], types: 
             writer.write(connections[topic], time, data)
 
 
-def mcap(path: Path, *, finish: bool = True, cut: int = 0, **options: Any) -> Path:
+def mcap(
+    path: Path, *, frames: int = FRAMES, finish: bool = True, cut: int = 0, **options: Any
+) -> Path:
     """Write the table; remove ``cut`` bytes from the end."""
     path /= "a.mcap"
     with mcap_writer(path, finish=finish, **({"chunk_size": 60_000} | options)) as writer:
         channels = McapChannels(writer, FACTORY.typestore)
-        for item in serialized(stream(FACTORY, FRAMES), FACTORY):
+        for item in serialized(stream(FACTORY, frames), FACTORY):
             channels.write(*item)
     if cut:
         path.write_bytes(path.read_bytes()[:-cut])
@@ -299,7 +301,7 @@ def clocks(path: Path, kind: str) -> Path:
             if hasattr(message, "header"):
                 stamp = {"uptime": time - EPOCH + SECOND, "stuck": EPOCH}.get(kind, 0)
                 if kind == "jump":
-                    stamp = time + (3600 * SECOND if number > 6 else 0)
+                    stamp = time + (3600 * SECOND if number > 3 else 0)
                 stamp_of = message.header.stamp
                 stamp_of.sec, stamp_of.nanosec = divmod(stamp, SECOND)
             yield topic, time, message

@@ -148,7 +148,7 @@ def damage(name: str, tmp_path: Path, *, cuts: int, flips: int) -> None:
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_damaged_recording_gives_intact_frames(name: str, tmp_path: Path) -> None:
-    damage(name, tmp_path, cuts=12, flips=30)
+    damage(name, tmp_path, cuts=6, flips=10)
 
 
 @pytest.mark.many

@@ -857,7 +857,7 @@ def test_table_with_labels_on_invalid_lines_is_kept(
 def processed(shapecat: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Process a recording; return it and its run folder."""
     folder = tmp_path_factory.mktemp("corrected")
-    recording = record(folder / "lab.mcap", 24)
+    recording = record(folder / "lab.mcap", 12)
     shapecat("process", recording, "--out", folder / "out", "--no-rrd", "--jobs", 1)
     return recording, folder / "out" / "lab"
 

@@ -18,7 +18,7 @@ from shapecat.runs.tables.segments import group_frames
 from shapecat.tracking import detection_table, fusion
 from shapecat.types import CATEGORIES
 
-FRAMES = 300
+FRAMES = 180
 
 
 def tracked(folder: Path) -> tuple[pa.Table, str]:

@@ -27,6 +27,7 @@ def test_odd_recording_has_expected_outcome(name: str, tmp_path: Path) -> None:
 EXPECTED = {"watercan.bag": 0, "asci-file.txt": 3, "empty-file.bag": 3, "metadata.yaml": 3}
 
 
+@pytest.mark.many  # the cases above are of the same kinds
 @pytest.mark.skipif(not odd.COLLECTION.exists(), reason="needs the collection of odd recordings")
 def test_collected_recording_has_expected_exit_code(tmp_path: Path) -> None:
     for number, path in enumerate(odd.recordings(odd.COLLECTION)):

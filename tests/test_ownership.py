@@ -15,7 +15,7 @@ OPTIONS = ("--no-rrd", "--jobs", 1)
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(tmp_path_factory.mktemp("ownership") / "lab.mcap", 12)
+    return record(tmp_path_factory.mktemp("ownership") / "lab.mcap", 4)
 
 
 @pytest.mark.parametrize("option", ["--overwrite", "--no-mcap"])

@@ -46,7 +46,7 @@ FILES = {
 @pytest.fixture(scope="module")
 def recording(shapecat: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("simulated") / "table.mcap"
-    assert shapecat("simulate", path, "--frames", 20, "--seed", 3).exit_code == 0
+    assert shapecat("simulate", path, "--frames", 12, "--seed", 3).exit_code == 0
     return path
 
 
@@ -76,8 +76,8 @@ def test_originals_are_kept_and_annotations_decode(recording: Path, run_folder: 
 
     topics = ["/shapecat/detections", "/shapecat/scene"]
     found = {topic: read_ros(run_folder / "annotated.mcap", topic) for topic in topics}
-    assert {topic: len(messages) for topic, messages in found.items()} == dict.fromkeys(topics, 20)
-    assert sum(len(message.detections) for _, message in found[topics[0]]) > 100
+    assert {topic: len(messages) for topic, messages in found.items()} == dict.fromkeys(topics, 12)
+    assert sum(len(message.detections) for _, message in found[topics[0]]) > 60
 
 
 def test_objects_are_detected_categorized_and_tracked(recording: Path, run_folder: Path) -> None:
@@ -328,7 +328,7 @@ def test_annotated_copy_of_damaged_recording_is_readable(
 ) -> None:
     """Other readers stop at a damaged chunk, which only the first reading of the frames detects."""
     monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: Guesser())
-    source = mcap(tmp_path, chunk_size=20_000)
+    source = mcap(tmp_path, frames=4, chunk_size=20_000)
     whole = messages(source)
     chunk = sorted(c.chunk_start_offset for c in summary_of(source).chunk_indexes)[2]
     data = bytearray(source.read_bytes())
@@ -422,6 +422,7 @@ def of_depth_images(
     )
 
 
+@pytest.mark.many  # `test_clouds_give_same_detections_as_depth_images` simulates them
 @pytest.mark.parametrize("name", ["clouds.mcap", "clouds.bag", "clouds_ros2"])
 def test_real_clouds_give_same_objects_as_depth_images(
     shapecat: Run,

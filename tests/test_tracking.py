@@ -82,11 +82,11 @@ def test_moving_object_is_tracked_through_occlusion() -> None:
 
 def test_ended_tracks_are_discarded() -> None:
     tracker = Tracker(SETTINGS)
-    for k in range(1000):
+    for k in range(300):
         step(tracker, k, [k // 10, 0, 0])
     assert tracker._active is not None
     assert len(tracker._active.ids) < 10
-    assert step(tracker, 2000, [5, 0, 0]) == [101]
+    assert step(tracker, 2000, [5, 0, 0]) == [31]
 
 
 def test_late_frame_does_not_end_track() -> None:
@@ -422,12 +422,12 @@ def test_streams_are_tracked_separately_and_numbered_together() -> None:
 
 
 def test_tracks_of_long_recording_stay_whole() -> None:
-    """Noise over a thousand frames must not break a track of an object at rest."""
+    """Noise over hundreds of frames must not break a track of an object at rest."""
     random = np.random.default_rng(0)
     places = np.column_stack([np.arange(6) * 0.2, np.zeros((6, 2))])
-    frames = [frame(k, places + random.normal(0, 0.01, (6, 3))) for k in range(1000)]
+    frames = [frame(k, places + random.normal(0, 0.01, (6, 3))) for k in range(400)]
     tracks = tuple(track_frames(frames, SETTINGS))
-    assert [track.hits for track in tracks] == [1000] * 6
+    assert [track.hits for track in tracks] == [400] * 6
 
 
 VIEWS = st.integers(0, 2**32 - 1).map(
@@ -666,7 +666,7 @@ def test_late_messages_of_one_sensor_do_not_put_it_behind_the_other() -> None:
     assert np.diff(track.stamps_ns).min() >= -3 * SECOND // 10
 
 
-@pytest.mark.parametrize("wrong", [20, 0, 1, 198, 199])
+@pytest.mark.parametrize("wrong", [20, 0, 1, 48, 49])
 @pytest.mark.parametrize("sensor", ["/a", "/b"])
 @pytest.mark.parametrize("ahead_s", [3, -5])
 def test_single_odd_stamp_does_not_put_a_sensor_behind_the_other(
@@ -676,10 +676,10 @@ def test_single_odd_stamp_does_not_put_a_sensor_behind_the_other(
     frames = [
         frame(k, [0, 0, 0], stamp_ns=k * SECOND // 10 + after_ns + odd_s * SECOND, topic=topic)
         for topic, after_ns in (("/a", 0), ("/b", SECOND // 30))
-        for k in range(200)
+        for k in range(50)
         for odd_s in [ahead_s * (k == wrong and topic == sensor)]
     ]
-    assert [track.hits for track in track_frames(frames, SETTINGS, together={"/a", "/b"})] == [400]
+    assert [track.hits for track in track_frames(frames, SETTINGS, together={"/a", "/b"})] == [100]
 
 
 @pytest.mark.parametrize("single", [False, True])

@@ -42,7 +42,10 @@ def at(k: int, ahead_ms: int = 0, late_ms: int = 0, epoch: int = EPOCH) -> tuple
 
 
 def recorded(path: Path, clocks: Clocks) -> Path:
-    """Write a recording at 10 Hz of a robot with a camera and an arm, of which one may move."""
+    """Write a recording at 10 Hz of a robot with a camera and an arm, of which one may move.
+
+    Its depth images are empty: only poses and times matter here.
+    """
     static = [("camera_link", OPTICAL, LINK_FROM_OPTICAL)]
     items: list[tuple[str, int, Any]] = [("/tf_static", EPOCH, MAKE.transforms(static, EPOCH))]
     for k in range(FRAMES):
@@ -58,7 +61,7 @@ def recorded(path: Path, clocks: Clocks) -> Path:
         stamp, logged = clocks.images(k)
         info = MAKE.camera_info(view.camera, stamp, OPTICAL)
         items.append(("/camera/depth/camera_info", logged, info))
-        items.append((TOPIC, logged, MAKE.image(view.depth, stamp, OPTICAL)))
+        items.append((TOPIC, logged, MAKE.image(0 * view.depth, stamp, OPTICAL)))
     return write(path, sorted(items, key=lambda item: item[1]))
 
 
