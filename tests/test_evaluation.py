@@ -5,7 +5,7 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -54,6 +54,7 @@ from shapecat.evaluation.training import (
 )
 from shapecat.evaluation.views import DescribedView, DescribedViews, describe_views
 from shapecat.learning import Categorizer, load_model
+from shapecat.learning.training import LearningSettings
 from shapecat.runs.labels.meaning import order_categories
 
 
@@ -149,6 +150,15 @@ def write_dataset(
                 points = visible_points("post" if name == "unknown" else name, size, rng)
                 np.savez(folder / f"{view}.npz", points=points, viewpoint=[0.7, 0.7, 0.8])
     return root
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_rounds() -> Iterator[None]:
+    """Boost for a fifth of the usual rounds, which suffices for some views of three shapes."""
+    with pytest.MonkeyPatch.context() as patch:
+        fewer = partial(LearningSettings, rounds=100)
+        patch.setattr("shapecat.evaluation.training.LearningSettings", fewer)
+        yield
 
 
 @pytest.fixture(scope="module")

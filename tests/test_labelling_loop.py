@@ -88,15 +88,25 @@ def command(shapecat: Run, *words: object) -> str:
     return str(result.stdout)
 
 
-def test_new_category_is_learned_from_corrections(shapecat: Run, tmp_path: Path) -> None:
+OTHERS = {"kitchen": 5, "office": 6, "bar": 7}
+"""Seeds of further tables."""
+
+
+@pytest.mark.parametrize("tables", [{}, pytest.param(OTHERS, marks=pytest.mark.many)])
+def test_new_category_is_learned_from_corrections(
+    shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tables: dict[str, int]
+) -> None:
     """Two labels are wrong and one category is new; known categories must not suffer.
 
     Views that were learned from are easy. On other tables, a model that fits badly or is too
     careful misses glasses, or takes cups for glasses.
     """
+    if not tables:  # a rough fit suffices for views that were learned from
+        monkeypatch.setattr("shapecat.learning.incremental._STEPS", 30)
+        monkeypatch.setattr("shapecat.learning.incremental._FEW_STEPS", 4)
     recording, *others = (
         record(table_with_glasses(seed), tmp_path / f"{name}.mcap", seed=seed, sensor=KINECT)
-        for name, seed in (("lab", 3), ("kitchen", 5), ("office", 6), ("bar", 7))
+        for name, seed in {"lab": 3, **tables}.items()
     )
     command(shapecat, "process", recording, "--out", tmp_path / "first", "--no-rrd")
     first = tmp_path / "first" / "lab"
@@ -140,8 +150,8 @@ def test_new_category_is_learned_from_corrections(shapecat: Run, tmp_path: Path)
         unseen = tmp_path / "second" / other.stem
         after, truth = categories(unseen), true_categories(other, unseen)
         predicted_glasses.update(truth[track] for track, name in after.items() if name == NEW)
-    assert predicted_glasses.keys() == {NEW}
-    assert predicted_glasses[NEW] >= 7  # of 12
+    assert predicted_glasses.keys() == ({NEW} if others else set())
+    assert predicted_glasses[NEW] >= 7 * len(others) / 3  # of 4 on each table
 
 
 def test_dataset_without_new_category_is_refused(shapecat: Run, tmp_path: Path) -> None:

@@ -88,6 +88,7 @@ def test_default_model_is_loaded_once() -> None:
     assert load_model() is load_model()
 
 
+@pytest.mark.many  # it measures the model; `test_pipeline` checks the categories of a run
 def test_new_simulated_objects_are_recognised(model: Categorizer) -> None:
     """The tables have seeds that training does not use; the model card has the full results."""
     kinds = ("pan", "hammer", "shoe", "chair")
@@ -279,6 +280,7 @@ def test_halo_is_cut_only_from_below() -> None:
     assert cut.points[:, 2].max() == view.points[:, 2].max()
 
 
+@pytest.mark.many  # as above
 @pytest.mark.skipif(not (DATA / "osd_learn").exists(), reason="no shared data")
 def test_real_objects_are_recognised(model: Categorizer) -> None:
     """Neither training nor the choice of parameters used these Kinect and RealSense images."""
