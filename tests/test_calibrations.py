@@ -36,7 +36,12 @@ def recorded(path: Path, zeros: Collection[int], *, late: bool = False) -> Path:
 
 @pytest.mark.parametrize(
     ("zeros", "late"),
-    [(range(3), False), (range(3), True), ((2, 3), False), (range(3, 6), True)],
+    [
+        pytest.param(range(3), False, marks=pytest.mark.many),
+        (range(3), True),
+        ((2, 3), False),
+        pytest.param(range(3, 6), True, marks=pytest.mark.many),
+    ],
 )
 def test_zeros_do_not_replace_a_calibration(
     zeros: Collection[int], late: bool, tmp_path: Path

@@ -501,7 +501,7 @@ def test_third_object_nearby_does_not_free_the_pixels_of_its_neighbours() -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sensor", ["kinect", "realsense"])
+@pytest.mark.parametrize("sensor", [pytest.param("kinect", marks=pytest.mark.many), "realsense"])
 def test_masks_agree_with_simulated_colour_camera(
     tmp_path: Path, sensor: Literal["kinect", "realsense"]
 ) -> None:

@@ -358,7 +358,9 @@ def test_plate_behind_pot_is_not_merged_with_its_floor(tilt_deg: float, x: float
     check(shapes, [1, 2], tilt_deg=tilt_deg)
 
 
-@pytest.mark.parametrize("tilt_deg", [50, 70, 89])
+@pytest.mark.parametrize(
+    "tilt_deg", [50, *(pytest.param(t, marks=pytest.mark.many) for t in (70, 89))]
+)
 def test_equal_objects_in_rows_stay_apart(tilt_deg: float) -> None:
     """Seen from above, they look as distant and as high as the near and the far wall of a pot."""
     places = [(x, y) for y in (-0.17, -0.085, 0.0, 0.085, 0.17) for x in (-0.21, -0.07, 0.07, 0.21)]
@@ -383,13 +385,13 @@ def drawer(width: float, height: float, wall: float, floor: float, yaw: float) -
 def test_most_drawers_are_one_object() -> None:
     """A floor a few millimetres high has a ragged outline, partly occluded."""
     rng, good = np.random.default_rng(5), 0
-    for _ in range(12):
+    for _ in range(6):
         width, height, floor = rng.uniform((0.2, 0.06, 0.005), (0.36, 0.1, 0.01))
         shapes = [table(1, 1), drawer(width, height, 0.01, floor, rng.uniform(0, np.pi / 2))]
         depth, labels = render(shapes, tilt_deg=rng.uniform(22, 60), distance=rng.uniform(0.7, 1))
         scene = found(frame_of(depth))
         good += len(scene.candidates) == 1 and overlaps(scene, labels, [1])[0] > 0.85
-    assert good >= 8
+    assert good >= 4
 
 
 @pytest.mark.parametrize(

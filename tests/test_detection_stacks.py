@@ -86,7 +86,7 @@ def test_object_on_edge_on_top_face_is_separated(seed: int, labels: list[int]) -
     assert overlap_in_clutter(seed, labels) > 0.8
 
 
-@pytest.mark.parametrize(("seed", "labels"), [(541, [26]), (651, [23]), (944, [29])])
+@pytest.mark.parametrize(("seed", "labels"), [(541, [26]), another(651, [23]), another(944, [29])])
 def test_object_leaning_over_another_is_separated(seed: int, labels: list[int]) -> None:
     """The leaning one ends in the air, but is wider than a handle or rises far above the other."""
     assert overlap_in_clutter(seed, labels) > 0.8
@@ -97,7 +97,7 @@ def test_bowl_is_not_a_neck_of_can_below() -> None:
     assert overlap_in_clutter(464, [20, 27]) > 0.8
 
 
-@pytest.mark.parametrize(("seed", "label"), [(703, 23), (938, 20)])
+@pytest.mark.parametrize(("seed", "label"), [(703, 23), another(938, 20)])
 def test_tall_box_is_not_a_side_of_shelf(seed: int, label: int) -> None:
     """Its faces are at a grazing angle, too, but some of its top is visible."""
     assert overlap_in_clutter(seed, [label]) > 0.8
@@ -108,9 +108,9 @@ Scenery = Callable[[np.random.Generator], list[Shape]]
 
 @cache
 def rendered(scenery: Scenery) -> list[tuple[np.random.Generator, Array, Any, list[int]]]:
-    """Return ten synthetic scenes: generator, depth, pixel labels and labels of the objects."""
+    """Return six synthetic scenes: generator, depth, pixel labels and labels of the objects."""
     scenes = []
-    for seed in range(10):
+    for seed in range(6):
         rng = np.random.default_rng((7, seed))
         shapes = scenery(rng)
         depth, labels = render(shapes, tilt_deg=rng.uniform(25, 35), seed=seed)
@@ -147,7 +147,7 @@ def test_two_cans_behind_a_third_are_not_merged() -> None:
     check([*shapes, can(0, -0.02, 0, 0.035, 0.12)], [1, 2, 3], tilt_deg=25)
 
 
-@pytest.mark.parametrize(("seed", "labels"), [(140, [21, 23]), (437, [21, 28])])
+@pytest.mark.parametrize(("seed", "labels"), [(140, [21, 23]), another(437, [21, 28])])
 def test_object_is_separated_from_equally_wide_support(seed: int, labels: list[int]) -> None:
     """Bottles stand on cans and boxes without a visible top; they meet at one height."""
     assert overlap_in_clutter(seed, labels) > 0.8

@@ -210,7 +210,7 @@ def test_exporting_again_removes_views_with_earlier_labels(run: Path, tmp_path: 
     assert (own / "view.pcd").exists()
 
 
-@pytest.mark.parametrize("suffix", ["", "_full"])
+@pytest.mark.parametrize("suffix", [pytest.param("", marks=pytest.mark.many), "_full"])
 def test_kitti_boxes_match_tables_within_1_mm(run: Path, tmp_path: Path, suffix: str) -> None:
     """Detectors are trained on whole objects; visible boxes are optional."""
     export_run(read_finished(run), "kitti", tmp_path, visible_boxes=not suffix)

@@ -154,7 +154,9 @@ def test_viewpoint_is_found_again_after_it_moved(tmp_path: Path) -> None:
     assert len({frame.camera for frame in found}) == 1
 
 
-@pytest.mark.parametrize("mount", [*MOUNTS, LINK])
+@pytest.mark.parametrize(
+    "mount", ["base_link", pytest.param("world", marks=pytest.mark.many), LINK]
+)
 def test_cloud_in_other_frame_gives_the_results_of_its_camera(mount: str, tmp_path: Path) -> None:
     """Objects in transformed clouds were split: the origin was mistaken for the camera."""
     map_from_mounts = [
