@@ -176,10 +176,10 @@ def test_stacks_occur_in_clutter_and_on_shelves() -> None:
     stacked = [
         sum(t.on_track is not None for t in make_scene(kind, np.random.default_rng(s)).objects)
         for kind in ("clutter", "shelf")
-        for s in range(3)
+        for s in range(2)
     ]
 
-    assert sum(stacked) >= 5
+    assert sum(stacked) >= 3
 
 
 def test_turntable_moves_objects_and_not_the_camera() -> None:
@@ -305,7 +305,14 @@ def test_robot_links_compose_to_the_camera_pose(world: World) -> None:
 # --- recordings ----------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module", params=["mcap", "ros1", "ros2"])
+CONTAINERS = [
+    "mcap",
+    # `test_pipeline` processes such recordings.
+    *(pytest.param(name, marks=pytest.mark.many) for name in ("ros1", "ros2")),
+]
+
+
+@pytest.fixture(scope="module", params=CONTAINERS)
 def recording(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     container: FormatName = request.param
     out = tmp_path_factory.mktemp("sim") / "demo"
@@ -414,7 +421,7 @@ def digest(path: Path) -> str:
 def test_recordings_are_reproducible(tmp_path: Path) -> None:
     """Every machine generates the fixtures itself: they must be equal."""
     paths = [
-        simulate(tmp_path / name, scene="clutter", frames=2, seed=seed)
+        simulate(tmp_path / name, scene="clutter", frames=1, seed=seed)
         for name, seed in (("a", 3), ("b", 3), ("c", 4))
     ]
     first, second, other = (digest(path) for path in paths)
@@ -494,6 +501,7 @@ def test_recordings_without_frames_or_rate_are_refused(tmp_path: Path, odd: dict
 # --- scanned meshes ------------------------------------------------------------------------------
 
 
+@pytest.mark.many  # `test_simulation_shapes` checks that simulated objects stand
 def test_scanned_meshes_are_placed_upright(real_data: Path) -> None:
     """Wrong poses would look like a weakness of the model."""
     pytest.importorskip("open3d")
