@@ -75,15 +75,9 @@ def run_here(line: str, shapecat: Callable[..., Result]) -> None:
     assert done.exit_code == 0, f"{line}\n{done.output}"
 
 
+@pytest.mark.many  # `test_docs` checks that their commands and options exist
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "page",
-    [
-        "howto-bag.md",
-        pytest.param("tutorial.md", marks=pytest.mark.many),
-        pytest.param("howto-labelling.md", marks=pytest.mark.many),  # see `test_labelling_loop`
-    ],
-)
+@pytest.mark.parametrize("page", ["howto-bag.md", "tutorial.md", "howto-labelling.md"])
 def test_documented_commands_work(
     page: str,
     shapecat: Callable[..., Result],

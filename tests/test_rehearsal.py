@@ -220,7 +220,7 @@ print("processed")
 """
 
 
-@pytest.mark.parametrize("says", ["", "# no __main__"])
+@pytest.mark.parametrize("says", ["", pytest.param("# no __main__", marks=pytest.mark.many)])
 def test_script_without_main_guard_does_not_deadlock(tmp_path: Path, says: str) -> None:
     """A compiling process would run the script again and wait for its parent's lock."""
     script = tmp_path / "script.py"
