@@ -44,8 +44,8 @@ def moving(make: MessageFactory, *, every: int = 1, late: int = 30) -> Items:
     return sorted(items, key=lambda item: item[1])
 
 
-def in_mcap(path: Path) -> Path:
-    return ros.write(path / "a.mcap", moving(MessageFactory(2)), chunk_size=300)
+def in_mcap(path: Path, *, late: int = 30) -> Path:
+    return ros.write(path / "a.mcap", moving(MessageFactory(2), late=late), chunk_size=300)
 
 
 def in_bag(path: Path) -> Path:
@@ -90,9 +90,10 @@ def test_windowed_transforms_equal_those_of_full_read(
         assert next(others, None) is not None
 
 
-def test_fixed_frame_may_appear_late(tmp_path: Path) -> None:
+@pytest.mark.parametrize("late", [30, SECONDS - 2])
+def test_fixed_frame_may_appear_late(tmp_path: Path, late: int) -> None:
     """Localisation may start long after the recording does, and yet all tracks are in the map."""
-    with open_recording(in_mcap(tmp_path)) as recording:
+    with open_recording(in_mcap(tmp_path, late=late)) as recording:
         window = TransformWindow.of(recording)
 
         assert fixed_frame(window.tree, "camera") == "map"
