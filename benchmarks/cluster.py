@@ -226,8 +226,16 @@ def check(folder: Path, *, recordings: int, frames: int) -> list[tuple[str, ...]
     frame_s = (long_s - startup_s) / (frames - 1)
     base_s = wall_s("w1", folder / "in", 1)
     recording_s = max(0.0, (base_s - startup_s) / recordings - frames * frame_s)
-    given = Assumed(recordings=recordings, median_frames=frames, startup_s=startup_s, cores=2)
-    given = replace(given, spread=0.0, read_mb=0.0, written_mb=0.0, recording_s=recording_s)
+    given = Assumed(
+        recordings=recordings,
+        median_frames=frames,
+        spread=0.0,
+        read_mb=0.0,
+        written_mb=0.0,
+        startup_s=startup_s,
+        recording_s=recording_s,
+        cores=2,
+    )
     costs = Measured(frame_s, 0.001, 0.0001, 0.001)
     rows: list[tuple[str, ...]] = []
     for workers in range(1, 5):

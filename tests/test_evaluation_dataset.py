@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from shapecat.arrays import F4
 from shapecat.errors import RecordingError
 from shapecat.evaluation.clouds import read_pcd, read_ply
-from shapecat.evaluation.dataset import guess_eye, read_dataset, read_view
+from shapecat.evaluation.dataset import estimate_eye, read_dataset, read_view
 
 POINTS = np.array([[0.25, -1.5, 0.0], [np.nan] * 3, [1e-3, 2.0, 3.5]], np.float32)
 HEADER = (
@@ -314,7 +314,7 @@ def test_viewpoint_far_away_counts_as_unknown(tmp_path: Path) -> None:
     points = np.random.default_rng(0).random((50, 3)).astype(np.float32)
     view = read_view(save(tmp_path, points, viewpoint=np.array([1e300, 0, 1])))
 
-    assert view.eye.tolist() == guess_eye(points).tolist()
+    assert view.eye.tolist() == estimate_eye(points).tolist()
 
 
 @pytest.mark.parametrize("azimuth_deg", [0, 45, 130, 250])
@@ -329,7 +329,7 @@ def test_missing_viewpoint_is_estimated(azimuth_deg: float) -> None:
     top = np.stack([radius * np.cos(angle[:2000]), radius * np.sin(angle[:2000])], axis=1)
     points = np.concatenate([side[side[:, :2] @ eye[:2] > 0], np.insert(top, 2, 0.1, axis=1)])
 
-    found = guess_eye(points.astype(np.float32)) - points.mean(axis=0)
+    found = estimate_eye(points.astype(np.float32)) - points.mean(axis=0)
 
     direction = (eye - points.mean(axis=0)) / np.linalg.norm(eye - points.mean(axis=0))
     assert found @ direction > np.cos(np.radians(40))
@@ -340,6 +340,6 @@ def test_view_of_many_points_gets_a_viewpoint() -> None:
     rng = np.random.default_rng(1)
     points = rng.normal(0, 1, (400_000, 3)) * [0.05, 0.05, 0.0005]
 
-    found = guess_eye(points.astype(np.float32))
+    found = estimate_eye(points.astype(np.float32))
 
     np.testing.assert_allclose(np.linalg.norm(found), 1, atol=1e-3)

@@ -18,7 +18,7 @@ from shapecat.arrays import F4, F8, Record, array
 from shapecat.errors import RecordingError
 from shapecat.evaluation.clouds import CloudFile, read_pcd, read_ply
 
-__all__ = ["DAMAGED", "Dataset", "View", "guess_eye", "read_dataset", "read_view"]
+__all__ = ["DAMAGED", "Dataset", "View", "estimate_eye", "read_dataset", "read_view"]
 
 _FARTHEST_M = 100.0
 _LARGEST_M = 5.0
@@ -117,7 +117,7 @@ def _views_among(root: Path, pattern: str) -> list[Path]:
 def read_view(path: Path) -> View:
     """Read one view; its folders name the category and the instance.
 
-    If the file states no valid position of the sensor, `guess_eye` estimates it.
+    If the file states no valid position of the sensor, `estimate_eye` estimates it.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def read_view(path: Path) -> View:
         raise RecordingError(msg)
     eye = _valid_eye(stated_eye)
     if eye is None:
-        eye = guess_eye(points)
+        eye = estimate_eye(points)
     return View(points, eye, path.parent.parent.name, path.parent.name)
 
 
@@ -169,7 +169,7 @@ def _valid_eye(eye: F8 | None) -> F8 | None:
     return eye if np.all(np.abs(eye) <= _FARTHEST_M) else None
 
 
-def guess_eye(points: F4) -> F8:
+def estimate_eye(points: F4) -> F8:
     """Estimate the position of the sensor from a partial view, 1 m from its centre.
 
     Seen from the sensor, no two points of a view have the same direction. Of 48 positions around

@@ -62,9 +62,9 @@ def evaluate_folder(
         raise RecordingError(msg)
     train = None
     if baselines.resolve() != root.resolve():
-        others = read_dataset(baselines)
+        training_set = read_dataset(baselines)
         train = describe_views(
-            observed(others, "train", len(others), observe),
+            observed(training_set, "train", len(training_set), observe),
             settings=Settings(),
             with_functions=True,
         )

@@ -84,28 +84,28 @@ class FullBoxes:
         ------
         OutputError : the table of detections is unreadable.
         """
-        sightings = self._sightings(tracks)
-        chosen = [_spread(len(sighting.rows)) for sighting in sightings]
-        rows = [sighting.rows[picked] for sighting, picked in zip(sightings, chosen, strict=True)]
+        seen_tracks = self._track_views(tracks)
+        chosen = [_spread(len(seen.rows)) for seen in seen_tracks]
+        rows = [seen.rows[picked] for seen, picked in zip(seen_tracks, chosen, strict=True)]
         lengths = [len(track.frames) for track in tracks]
         result = np.full((sum(lengths), _WIDTH), np.nan, np.float32)
-        for track, sighting, picked, details, part in zip(
+        for track, seen, picked, details, part in zip(
             tracks,
-            sightings,
+            seen_tracks,
             chosen,
             self._read(rows, _DETAILS),
             _split(result, lengths),
             strict=True,
         ):
             if len(picked):
-                views = self._views(sighting, picked, details)
+                views = self._views(seen, picked, details)
                 fused = fuse_boxes(
-                    views, view_weights(sighting.partial[picked]), track.posterior, categories
+                    views, view_weights(seen.partial[picked]), track.posterior, categories
                 )
-                self._write_in_views(fused, sighting, part)
+                self._write_in_views(fused, seen, part)
         return result
 
-    def _sightings(self, tracks: Sequence[Track]) -> "list[_TrackViews]":
+    def _track_views(self, tracks: Sequence[Track]) -> "list[_TrackViews]":
         """Return, for each track, its detections that have a full box."""
         detected = [np.flatnonzero(track.detections >= 0) for track in tracks]
         rows = [track.detections[at] for track, at in zip(tracks, detected, strict=True)]
@@ -118,30 +118,30 @@ class FullBoxes:
             )
         return result
 
-    def _views(self, sighting: "_TrackViews", picked: I4, details: F4) -> BoxViews:
+    def _views(self, seen: "_TrackViews", picked: I4, details: F4) -> BoxViews:
         """Return the views with the indices ``picked`` (k,) of a track, in the fixed frame.
 
         ``details`` are their values of `_DETAILS` (k, 3 + `DIRECTIONS`).
         """
-        boxes, poses = sighting.boxes[picked], self.frames.poses_of(sighting.rows[picked])
+        boxes, poses = seen.boxes[picked], self.frames.poses_of(seen.rows[picked])
         centers, axes = _placed(boxes, poses)
         sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)
         return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
 
-    def _write_in_views(self, fused: FusedBox, sighting: "_TrackViews", result: F4) -> None:
+    def _write_in_views(self, fused: FusedBox, seen: "_TrackViews", result: F4) -> None:
         """Write the fused box of a track to ``result``, in the sensor frame of each of its views.
 
         ``result`` (frames, 13) holds the rows of the track in `of_tracks`.
         """
-        for first in range(0, len(sighting.rows), _BLOCK):
+        for first in range(0, len(seen.rows), _BLOCK):
             block = slice(first, first + _BLOCK)
-            boxes, poses = sighting.boxes[block], self.frames.poses_of(sighting.rows[block])
+            boxes, poses = seen.boxes[block], self.frames.poses_of(seen.rows[block])
             centers, axes = fused.in_views(*_placed(boxes, poses), boxes[:, 3:6])
             turns, places = poses[:, :, :3], poses[:, :, 3]
             back = np.einsum("kji,kj->ki", turns, centers - places)
             quaternions = Rotation.from_matrix(np.swapaxes(turns, 1, 2) @ axes).as_quat()
             size, std = (np.broadcast_to(values, back.shape) for values in (fused.size, fused.std))
-            result[sighting.at[block]] = np.hstack([back, size, quaternions, std])
+            result[seen.at[block]] = np.hstack([back, size, quaternions, std])
 
     def _read(self, rows: Sequence[I4], values: _Selection) -> list[F4]:
         """Return, for each track, the values (n, k) in its ``rows`` (n,) of the table."""

@@ -20,7 +20,7 @@ from shapecat.recordings.decoding.decoders import LIBRARY_ERRORS, schema_of
 __all__ = ["rewrite"]
 
 _Registered = tuple[int, Callable[[bytes | memoryview], memoryview] | None]
-"""The number of a channel in the written file, and the converter of its messages, or None."""
+"""The id of a channel in the new file, and the converter of its messages, or None."""
 
 
 def rewrite(
@@ -45,8 +45,8 @@ def rewrite(
     writer.start(parts[0].profile if parts else "ros2", "shapecat")
     target = _Target(writer, convert=recording.kind == "ros1")
     for channel in recording.channels():
-        target.id_of(channel)
-    numbers = [target.register(channel) for channel in channels]
+        target.registered(channel)
+    ids = [target.register(channel) for channel in channels]
     sequences: Counter[int] = Counter()
     streams: list[Iterable[Message | EncodedMessage]] = [recording.messages(), items]
     for item in merge(*streams, key=attrgetter("log_time_ns")):
@@ -54,7 +54,7 @@ def rewrite(
             target.write(item)
             continue
         position, time = item.channel, item.log_time_ns
-        writer.add_message(numbers[position], time, item.data, time, sequences[position])
+        writer.add_message(ids[position], time, item.data, time, sequences[position])
         sequences[position] += 1
     for part in parts:
         _copy_extras(part, writer)
@@ -75,16 +75,16 @@ class _Target:
     def write(self, message: Message) -> None:
         """Write a message, converted or wrapped if necessary."""
         channel = message.channel
-        number, convert = self.id_of(channel)
+        channel_id, convert = self.registered(channel)
         data: bytes | memoryview = message.data
         try:
             data = convert(data) if convert is not None else data
         except LIBRARY_ERRORS:
-            number, data = self._raw_number(channel), wrap_raw(channel, data)
+            channel_id, data = self._raw_id(channel), wrap_raw(channel, data)
         times = (message.log_time_ns, bytes(data), message.publish_time_ns)
-        self.writer.add_message(number, *times, message.sequence)
+        self.writer.add_message(channel_id, *times, message.sequence)
 
-    def id_of(self, channel: Channel) -> _Registered:
+    def registered(self, channel: Channel) -> _Registered:
         """Return the id of a channel in the new file, and the converter of its messages or None.
 
         A new channel is registered first.
@@ -107,10 +107,10 @@ class _Target:
             return self.register(AnnotationChannel(*about)), None
         converted = convert_channel(channel)
         if converted is None:
-            return self._raw_number(channel), lambda data: wrap_raw(channel, data)
+            return self._raw_id(channel), lambda data: wrap_raw(channel, data)
         return self.register(converted[0]), converted[1]
 
-    def _raw_number(self, channel: Channel) -> int:
+    def _raw_id(self, channel: Channel) -> int:
         if channel.topic not in self.raw:
             self.raw[channel.topic] = self.register(raw_channel(channel.topic))
         return self.raw[channel.topic]
