@@ -53,6 +53,8 @@ def test_objects_move_to_the_floor_with_the_table_removed() -> None:
     ]
     assert len(lowest) > 0
     assert np.abs(lowest).max() < 0.01
+    # The truth must not name a plane that is gone.
+    assert {item.on_support for item in below.objects} <= {"floor", None}
 
 
 def test_random_viewpoint_faces_the_objects_within_the_range_of_the_sensor() -> None:

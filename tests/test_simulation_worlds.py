@@ -24,7 +24,10 @@ from shapecat.simulation.camera.render import geometry, render
 from shapecat.simulation.camera.sensors import resized
 from shapecat.simulation.containers import FormatName
 from shapecat.simulation.recorder import EPOCH_NS, record, robot_links
+from shapecat.simulation.scenes import layout
+from shapecat.simulation.scenes.furniture import make_table
 from shapecat.simulation.scenes.kinds import SCENES, SceneKind
+from shapecat.simulation.shapes.categories import make_object
 from shapecat.simulation.shapes.mesh import Mesh
 from shapecat.simulation.shapes.scans import load_mesh, uprighted
 from shapecat.simulation.shapes.stable_poses import stable_poses
@@ -170,6 +173,27 @@ def test_tabletop_contains_all_categories() -> None:
         world = make_scene("tabletop", np.random.default_rng(seed), frames=2)
         assert {item.category for item in world.objects} == set(CATEGORIES)
         assert 6 <= len(world.objects) <= 10
+
+
+def test_tabletop_of_more_categories_than_objects_draws_some_of_them() -> None:
+    """Training on categories of one's own may need more than ten; an empty range was an error."""
+    names = [f"{name}s" for name in CATEGORIES]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(layout, "make_object", lambda _name, rng: make_object("can", rng))
+        rng = np.random.default_rng(0)
+        world = make_scene("tabletop", rng, frames=1, categories=(*CATEGORIES, *names))
+
+    assert len({item.category for item in world.objects}) == len(world.objects) == 10
+
+
+def test_boxes_turned_over_are_upside_down_in_layouts_as_in_piles() -> None:
+    """The truth of a pile called such a box upside down, that of a layout did not."""
+    piece = layout.make_piece("box", np.random.default_rng(0), resting_pose="upside_down")
+    table = make_table(np.random.default_rng(0))
+    placed = layout.place_piece(piece, 0, piece.stable_pose.pose, table, None)
+
+    assert placed.pose.rotation[2, 2] < -0.9
+    assert (placed.upside_down, placed.lying) == (True, False)
 
 
 def test_stacks_occur_in_clutter_and_on_shelves() -> None:

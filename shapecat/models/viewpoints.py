@@ -55,7 +55,11 @@ def move_to_floor(world: World) -> World:
     table = next(support for support in world.supports if support.name == "table")
     down = np.array([0.0, 0.0, -table.height])
     objects = (
-        replace(item, pose=Pose(item.pose.rotation, item.pose.translation + down))
+        replace(
+            item,
+            pose=Pose(item.pose.rotation, item.pose.translation + down),
+            on_support="floor" if item.on_support == table.name else item.on_support,
+        )
         for item in world.objects
     )
     rest = (s for s in world.supports if s is not table and not s.name.startswith("robot"))

@@ -89,7 +89,7 @@ def _tabletop(rng: Generator, spec: _SceneSpec) -> World:
     """Place up to ten objects, with gaps, on a table: one of each category first."""
     room, table = make_room(rng, wall_chance=0.3), make_table(rng)
     layout = Layout(rng, gap=rng.uniform(0.015, 0.05))
-    count = int(rng.integers(max(6, len(spec.categories)), 11))
+    count = int(rng.integers(min(max(6, len(spec.categories)), 10), 11))
     for category in spec.draw(rng, count):
         layout.put(category, table, np.array([0.38, 0.27]), stack=0.06)
     target = np.array([0, 0, table.height + 0.05])

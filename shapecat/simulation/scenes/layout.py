@@ -71,8 +71,7 @@ def place_piece(
     support : the support that it stands on, unless it stands on another object.
     on_track : number of the object that it stands on, if any.
     """
-    # Every pose of a box counts as upright.
-    resting_pose = "upright" if piece.category == "box" else piece.stable_pose.name
+    resting_pose = piece.stable_pose.name
     return PlacedObject(
         track,
         piece.category,
@@ -81,7 +80,7 @@ def place_piece(
         pose,
         support.name if on_track is None else None,
         on_track,
-        lying=resting_pose == "lying",
+        lying=resting_pose == "lying" and piece.category != "box",
         upside_down=resting_pose == "upside_down",
     )
 
