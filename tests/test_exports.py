@@ -249,6 +249,15 @@ def test_kitti_refuses_categories_with_the_same_type(
     assert not (tmp_path / "kitti" / "table").exists()
 
 
+def test_kitti_accepts_equal_types_that_no_two_tracks_have(run: Path, tmp_path: Path) -> None:
+    """A model may know `wine_glass` although all tracks were relabelled `wine glass`."""
+    finished = read_finished(run)
+    finished.info["model"]["categories"] += ["wine_glass"]
+
+    assert "wine glass" in {label.category for label in finished.labels.values()}
+    assert export_run(finished, "kitti", tmp_path) > 8
+
+
 def intrinsics(run: Path) -> np.ndarray:
     finished = read_finished(run)
     with open_source(finished.info) as recording:

@@ -75,7 +75,7 @@ def frame() -> Frame:
 
 def kitti(folder: Path, *, truncated: bool, occluded: bool) -> KittiLabel:
     views: Any = [(labelled(truncated=truncated, occluded=occluded), frame(), None)]
-    finished: Any = SimpleNamespace(categories=())
+    finished: Any = SimpleNamespace(labels={})
     assert write_kitti(folder, views, finished) == 1
     (label,) = read_labels(folder)
     return label
@@ -124,7 +124,7 @@ def test_kitti_frame_of_depth_image_looks_along_its_camera(
     up = level_from_sensor.inv().apply([0, -1, 0])
     seen = replace(labelled(truncated=False, occluded=False), up=up)
     views: Any = [(seen, frame(), None)]
-    finished: Any = SimpleNamespace(categories=())
+    finished: Any = SimpleNamespace(labels={})
     write_kitti(tmp_path, views, finished)
 
     level = level_from_sensor.apply(frame().xyz())  # x right, y down, z forward
@@ -143,7 +143,7 @@ def test_kitti_calibration_projects_points_into_colour_camera(tmp_path: Path) ->
     image = ColourImage("/color", 5, 6, "color", "rgb8", 200, 150, 600, data)
     view = ColourView(image, LensCamera(camera), pose)
     views: Any = [(labelled(truncated=False, occluded=False), frame(), Coloured(view, ()))]
-    finished: Any = SimpleNamespace(categories=())
+    finished: Any = SimpleNamespace(labels={})
     assert write_kitti(tmp_path, views, finished) == 1
 
     x, y, z = (frame().xyz() @ pose.rotation.T + pose.translation).T
@@ -185,7 +185,7 @@ def test_kitti_image_is_that_of_its_pinhole_camera(tmp_path: Path) -> None:
     image = ColourImage("/color", 5, 6, "color", "rgb8", 200, 150, 600, pixels.tobytes())
     view = ColourView(image, LensCamera(camera, "plumb_bob", lens), pose)
     views: Any = [(labelled(truncated=False, occluded=False), frame(), Coloured(view, ()))]
-    finished: Any = SimpleNamespace(categories=())
+    finished: Any = SimpleNamespace(labels={})
     write_kitti(tmp_path, views, finished)
 
     expected = projected_points(tmp_path)[row * CAMERA.width + column]
@@ -202,7 +202,7 @@ def test_kitti_image_on_depth_pixels_has_the_depth_camera(tmp_path: Path) -> Non
     lens = LensCamera(Camera(160, 120, 144.1, 140.3, 76.2, 62.8), "plumb_bob", (0.02, 0, 0, 0, 0))
     coloured = Coloured(ColourView(image, lens), ())
     views: Any = [(labelled(truncated=False, occluded=False), frame(), coloured)]
-    finished: Any = SimpleNamespace(categories=())
+    finished: Any = SimpleNamespace(labels={})
     write_kitti(tmp_path, views, finished)
 
     v, u = np.mgrid[:120, :160]
@@ -230,7 +230,7 @@ def test_kitti_2d_box_is_clipped_to_colour_image(
     )
     coloured = Coloured(ColourView(image, LensCamera(camera), IDENTITY), ())
     views: Any = [(labelled(truncated=False, occluded=False), frame(), coloured)]
-    finished: Any = SimpleNamespace(categories=())
+    finished: Any = SimpleNamespace(labels={})
     write_kitti(tmp_path, views, finished)
 
     assert read_labels(tmp_path)[0].box == box
@@ -299,7 +299,7 @@ def test_kitti_2d_box_of_cloud_is_minus_one(tmp_path: Path) -> None:
     points = frame().xyz()
     cloud = Frame("/scan", 0, 5, 6, "laser", points=points)
     views: Any = [(labelled(truncated=False, occluded=False), cloud, None)]
-    finished: Any = SimpleNamespace(categories=())
+    finished: Any = SimpleNamespace(labels={})
     write_kitti(tmp_path, views, finished)
 
     assert read_labels(tmp_path)[0].box == [-1, -1, -1, -1]
@@ -313,7 +313,7 @@ def test_kitti_keeps_cloud_of_level_lidar(tmp_path: Path) -> None:
         labelled(truncated=False, occluded=False), up=np.array([0.0, 0.0, 1.0]), objects=()
     )
     views: Any = [(level, Frame("/scan", 0, 5, 6, "laser", points=points), None)]
-    finished: Any = SimpleNamespace(categories=())
+    finished: Any = SimpleNamespace(labels={})
     write_kitti(tmp_path, views, finished)
 
     assert_allclose(read_points(tmp_path)[:, :3], points, atol=1e-6)
@@ -322,7 +322,7 @@ def test_kitti_keeps_cloud_of_level_lidar(tmp_path: Path) -> None:
 def test_kitti_turns_loose_points_of_camera_like_its_image(tmp_path: Path) -> None:
     """Taken for a laser scan with x forward, the cloud would lie beside the camera."""
     cloud = Frame("/points", 0, 5, 6, "optical", points=frame().xyz())
-    finished: Any = SimpleNamespace(categories=())
+    finished: Any = SimpleNamespace(labels={})
     found = []
     for name, seen in (("image", frame()), ("cloud", cloud)):
         (tmp_path / name).mkdir()
@@ -615,7 +615,7 @@ def test_kitti_lists_frame_of_each_number(tmp_path: Path) -> None:
     view = labelled(truncated=False, occluded=False)
     other = replace(view, topic="/left", index=17, stamp_ns=12_345, objects=())
     views: Any = [(view, frame(), None), (other, frame(), None)]
-    finished: Any = SimpleNamespace(categories=())
+    finished: Any = SimpleNamespace(labels={})
 
     assert write_kitti(tmp_path, views, finished) == 1
     assert (tmp_path / "frames.csv").read_text() == (
@@ -638,7 +638,7 @@ def test_kitti_2d_box_is_that_of_the_image_that_is_written(
     folders = tmp_path / "with", tmp_path / "alone"
     for folder, coloured in zip(folders, (Coloured(view, ()), None), strict=True):
         views: Any = [(labelled(truncated=False, occluded=False), frame(), coloured)]
-        finished: Any = SimpleNamespace(categories=())
+        finished: Any = SimpleNamespace(labels={})
         folder.mkdir()
         write_kitti(folder, views, finished)
     (label,), (alone,) = map(read_labels, folders)

@@ -43,9 +43,9 @@ def write_kitti(out: Path, frames: Iterable[PairedFrame], finished: FinishedRun)
 
     Raises
     ------
-    OutputError : two categories have the same type, apart from upper and lower case.
+    OutputError : the categories of two tracks have the same type, apart from upper and lower case.
     """
-    _require_distinct_types(finished.categories)
+    _require_distinct_types(sorted({label.category for label in finished.labels.values()}))
     for name in ("label_2", "calib", "velodyne"):
         (out / name).mkdir()
     count = 0
