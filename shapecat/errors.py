@@ -65,6 +65,9 @@ def explained(what: str, kind: type[ShapecatError]) -> Iterator[None]:
     """Raise an `OSError` of the block as ``kind``, with the message ``what`` and the reason."""
     try:
         yield
+    except FileExistsError as error:  # of a folder that is made unless it exists
+        msg = f"{what}: {error.filename} is not a folder"
+        raise kind(msg) from error
     except OSError as error:
         msg = f"{what}: {error.strerror or error}"
         raise kind(msg) from error

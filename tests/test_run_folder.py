@@ -79,13 +79,13 @@ def test_error_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_unwritable_path_is_reported_with_reason(tmp_path: Path) -> None:
-    """Users need neither an error number nor the path twice."""
+    """Users need no error number, and "File exists" would not say what hinders them."""
     (tmp_path / "file").write_text("")
     below, missing = tmp_path / "file" / "model.npz", tmp_path / "none"
 
     with pytest.raises(OutputError) as error:
         require_writable(below)
-    assert str(error.value) == f"{below}: cannot be written: File exists"
+    assert str(error.value) == f"{below}: cannot be written: {below.parent} is not a folder"
     with pytest.raises(OutputError) as error, replacing(below) as path:
         path.touch()
     assert str(error.value) == f"{below}: cannot be written: Not a directory"

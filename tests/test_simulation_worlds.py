@@ -494,7 +494,7 @@ def test_foreign_folder_is_refused_before_the_first_frame(tmp_path: Path) -> Non
 def test_unwritable_path_raises_output_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
 
-    with pytest.raises(OutputError, match="cannot write"):
+    with pytest.raises(OutputError, match=r"cannot write the recording: .*file is not a folder"):
         simulate(tmp_path / "file" / "demo.mcap", frames=1)
 
 

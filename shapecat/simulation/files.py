@@ -11,7 +11,7 @@ from typing import IO, Self
 import numpy as np
 
 from shapecat.arrays import U1
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, explained
 from shapecat.simulation.containers import CONTAINERS
 from shapecat.system.files import flush
 from shapecat.types import Camera
@@ -45,7 +45,8 @@ def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[li
     out = paths[0]
     try:
         _require_replaceable(out)
-        out.parent.mkdir(parents=True, exist_ok=True)
+        with explained(f"{out}: cannot write the recording", OutputError):
+            out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=".simulated-") as hidden:
             hidden_paths = [Path(hidden) / path.name for path in paths]
             yield hidden_paths
