@@ -50,6 +50,9 @@ def annotate(
     if by_place and labels is None:
         msg = "--by-place needs --labels: the folder or the tracks.csv of the other run"
         raise click.UsageError(msg)
+    if labels is not None and labels.is_dir() and not by_place:
+        msg = f"--labels {labels}: is a folder; name the table in it, or add --by-place"
+        raise click.UsageError(msg)
     before = _labels_of(run)
     with progress_bars() as bars:
         transfer = annotate_again(

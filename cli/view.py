@@ -37,7 +37,10 @@ def view(*, run: Path, web: bool, screenshot: Path | None) -> None:
     if web and screenshot is not None:
         msg = "--web and --screenshot exclude each other"
         raise click.UsageError(msg)
-    review = run if run.is_file() else run / "review.rrd"
+    if screenshot is not None and screenshot.suffix.lower() != ".png":
+        msg = f"--screenshot {screenshot}: name it .png"
+        raise click.UsageError(msg)
+    review = run if run.suffix.lower() == ".rrd" else run / "review.rrd"
     if not review.is_file():
         read_run(run)  # raises if there is no run
     if screenshot is not None:

@@ -290,6 +290,8 @@ def test_simulate_needs_name_of_recording(
     [
         (("report", "a", "--port", "8000"), "--port needs --serve"),
         (("view", "a", "--web", "--screenshot", "a.png"), "--web and --screenshot exclude"),
+        (("view", "a", "--screenshot", "a.txt"), "--screenshot a.txt: name it .png"),
+        (("annotate", "a", "--labels", "."), "--labels .: is a folder; name the table in it"),
     ],
 )
 def test_option_without_effect_is_wrong_usage(
@@ -528,6 +530,27 @@ def test_view_distinguishes_missing_run_from_missing_review(
     result = shapecat("view", runs / "a" / "lab")
     assert result.exit_code == 1
     assert "no review there; process the recording without --no-rrd" in result.stderr
+
+
+def test_view_opens_no_other_file_than_a_review(shapecat: Run, tmp_path: Path) -> None:
+    """The viewer shows any file; of a recording or a table, that was no review."""
+    (tmp_path / "lab.mcap").write_bytes(b"")
+    result = shapecat("view", tmp_path / "lab.mcap", "--screenshot", tmp_path / "a.png")
+
+    assert result.exit_code == 1
+    assert "lab.mcap: no run.json there; expected a folder" in result.stderr
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_place_without_run_names_one_nearby(shapecat: Run, tmp_path: Path) -> None:
+    """Users name the folder above a run, or a run that was interrupted."""
+    for name in (".c.partial", "b", "a"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.json").touch()
+
+    above = shapecat("scene", tmp_path, "--frame", 0).stderr
+    assert f"expected a folder made by `shapecat process`, such as {tmp_path / 'a'}\n" in above
+    assert "this one is unfinished" in shapecat("scene", tmp_path / "c", "--frame", 0).stderr
 
 
 def test_output_requested_later_is_added_to_run(

@@ -1052,7 +1052,7 @@ def test_missing_frame_error_lists_existing_frames(tmp_path: Path) -> None:
     for frame, topic, message in (
         (2, "/a", "no frame 2 on /a; its frames: 3 to 9 of /a"),
         (4, None, "no frame 4; its frames: 3 to 9 of /a, 0 to 2 of /b"),
-        (6, "/c", "no frame 6 on /c; its frames: none"),
+        (6, "/c", "no frame on /c; its topics: /a, /b"),
     ):
         with pytest.raises(OutputError) as error:
             _topic(tmp_path, frame, topic)

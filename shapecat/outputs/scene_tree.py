@@ -122,8 +122,11 @@ def _topic(folder: Path, frame: int, topic: str | None) -> str:
     for group in read_row_groups(folder / "frames.parquet", ["topic", "frame"]):
         for name, number in keys_of(group):
             frames.setdefault(name, []).append(number)
-    if topic is not None:
-        frames = {name: numbers for name, numbers in frames.items() if name == topic}
+    if topic in frames:
+        frames = {topic: frames[topic]}
+    elif topic is not None:
+        msg = f"{folder}: no frame on {topic}; its topics: {', '.join(frames) or 'none'}"
+        raise OutputError(msg)
     having = [name for name, numbers in frames.items() if frame in numbers]
     if len(having) == 1:
         return having[0]

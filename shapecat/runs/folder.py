@@ -310,5 +310,10 @@ def _content_of(folder: Path) -> bytes:
         try:
             return (folder / "run.json").read_bytes()
         except (FileNotFoundError, NotADirectoryError) as error:
-            msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
+            runs = (path.parent for path in folder.glob("[!.]*/run.json"))
+            example = f", such as {run}" if (run := min(runs, default=None)) else ""
+            if folder.name and partial_path(folder).exists():
+                example = "; this one is unfinished: repeat the command that makes it"
+            expected = "expected a folder made by `shapecat process`"
+            msg = f"{folder}: no run.json there; {expected}{example}"
             raise OutputError(msg) from error
