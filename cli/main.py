@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from shapecat import __version__
-from shapecat.errors import ShapecatError
+from shapecat.errors import ShapecatError, shortage
 from shapecat.system.stopping import Stopped, handling_signals
 
 from .annotate import annotate
@@ -42,6 +42,11 @@ class _Commands(click.Group):
             hint = "; finished work is kept; run the same command again to continue"
             click.echo(f"stopped{hint if resumable else ''}", err=True)
             ctx.exit(stopped.exit_code)
+        except Exception as error:
+            if not (text := shortage(error)):
+                raise
+            click.echo(f"Error: {text}", err=True)
+            ctx.exit(1)
 
     def main(self, *args: Any, **extra: Any) -> Any:
         try:

@@ -15,10 +15,17 @@ __all__ = [
     "explained",
     "listed",
     "printable",
+    "shortage",
 ]
 
 _CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]")
 
+_SHORTAGES = (
+    "can't start new thread",
+    "failed to map segment",  # when a library is loaded
+    "Cannot allocate memory",
+)
+"""What errors other than `MemoryError` say if the system refuses memory or threads."""
 _MOST_NAMES = 12
 """Largest number of names that `listed` shows."""
 
@@ -71,6 +78,15 @@ def explained(what: str, kind: type[ShapecatError]) -> Iterator[None]:
     except OSError as error:
         msg = f"{what}: {error.strerror or error}"
         raise kind(msg) from error
+
+
+def shortage(error: Exception) -> str:
+    """Return the message for an error that is a lack of memory or threads; empty for others."""
+    reason = str(error)
+    if isinstance(error, MemoryError) or any(text in reason for text in _SHORTAGES):
+        hint = "stop other programs, or raise the limits (ulimit)"
+        return f"out of memory or threads ({reason or 'no reason given'}); {hint}"
+    return ""
 
 
 def common_exit_code(codes: Collection[int]) -> int:

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from html.parser import HTMLParser
 from importlib import import_module
 from pathlib import Path
+from unittest.mock import Mock
 from urllib.parse import unquote
 
 import pyarrow as pa
@@ -551,6 +552,32 @@ def test_place_without_run_names_one_nearby(shapecat: Run, tmp_path: Path) -> No
     above = shapecat("scene", tmp_path, "--frame", 0).stderr
     assert f"expected a folder made by `shapecat process`, such as {tmp_path / 'a'}\n" in above
     assert "this one is unfinished" in shapecat("scene", tmp_path / "c", "--frame", 0).stderr
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError("Unable to allocate 9 GiB"), RuntimeError("can't start new thread")]
+)
+def test_lack_of_memory_is_no_bug(
+    shapecat: Run,
+    recording: Path,
+    tmp_path: Path,
+    error: Exception,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Under `ulimit -v`, the command printed a traceback and called it a bug in shapecat."""
+    with pytest.MonkeyPatch.context() as patch:
+        refuse = Mock(side_effect=error)
+        patch.setattr("shapecat.batch.runs.process", refuse)
+        patch.setattr("shapecat.outputs.scene_tree.read_finished", refuse)
+        results = [
+            shapecat("process", recording, "--out", tmp_path / "out"),
+            shapecat("scene", tmp_path, "--frame", 0),
+        ]
+
+    for result in results:
+        assert result.exit_code == 1
+        assert f"out of memory or threads ({error}); stop other programs" in result.stderr
+    assert caplog.text == ""
 
 
 def test_output_requested_later_is_added_to_run(

@@ -15,7 +15,7 @@ from shapecat.batch.ledger import MOST_TRIES, Ledger, Outcome
 from shapecat.batch.manifest import Manifest
 from shapecat.batch.plans import Task
 from shapecat.batch.remote import process_remote
-from shapecat.errors import ShapecatError
+from shapecat.errors import ShapecatError, shortage
 from shapecat.executors import ProgressReceiver, is_lost, send_progress
 from shapecat.pipeline import process
 from shapecat.runs.jobs import Job
@@ -189,5 +189,7 @@ def attempt(job: Job, observe: Observer, *, cores: int = 1, batch: str) -> Outco
     except ShapecatError as error:
         return Outcome(job, message=str(error), code=error.exit_code)
     except Exception as error:  # noqa: BLE001  one bad recording must not stop the others
+        if text := shortage(error):
+            return _failed(job, text)
         _log.exception("%s: this is a bug in shapecat", job.name)
         return _failed(job, f"{type(error).__name__}: {error}")
