@@ -211,6 +211,23 @@ def test_patterns_and_folders_of_storage_are_expanded(served: Path) -> None:
     assert stat_url(f"{url}/none.mcap") == ("", 0)
 
 
+@pytest.mark.parametrize("lab", ["memory://marks", "s3://lab/marks"])
+@pytest.mark.usefixtures("bucket")
+def test_question_mark_in_storage_is_part_of_the_name(tmp_path: Path, lab: str) -> None:
+    """It was taken for the query of a signed URL: names lost their ends and suffixes."""
+    names = ["what?.mcap", "a#1%25+\xfc.mcap"]
+    for name in names:
+        (Location(lab) / name).write(name.encode())
+    found = find_recordings([f"{lab}/"]).sources
+
+    assert {source.stem for source in found} == {name.removesuffix(".mcap") for name in names}
+    for source in found:
+        file = _download(source.url, tmp_path)
+        assert file.name == f"{source.stem}.mcap"
+        assert file.read_text() == file.name
+    assert names_in("s3://lab/day/a.mcap?versionId=4") == ("day", "a.mcap")
+
+
 @pytest.mark.parametrize(
     "lab", ["memory://brackets", pytest.param("s3://lab/brackets", marks=pytest.mark.many)]
 )

@@ -20,7 +20,7 @@ from shapecat.batch.sources import (
     is_compressed,
     is_named_as_bag,
 )
-from shapecat.batch.storage import Location, content_key, names_in
+from shapecat.batch.storage import Location, content_key, names_in, without_query
 from shapecat.errors import RecordingError
 
 __all__ = ["search_url", "search_url_beside_others", "stat_url"]
@@ -46,7 +46,7 @@ def search_url(url: str) -> list[Source]:
     ConfigError : a library is not installed.
     """
     location = Location(url)
-    if any(character in url.partition("?")[0] for character in "*["):  # signed URLs have queries
+    if any(character in without_query(url) for character in "*["):  # signed URLs have queries
         found = list(_search_matches(location))
         if found or location.info() is None:  # otherwise a name with brackets
             return sorted(found, key=attrgetter("url"))
@@ -88,7 +88,7 @@ def search_url_beside_others(url: str) -> list[Source]:
 
 def _is_remote_folder(location: Location) -> bool:
     """Return whether a URL is a folder; no request is made if it has the suffix of a recording."""
-    if has_recording_suffix(location.url.partition("?")[0]):
+    if has_recording_suffix(without_query(location.url)):
         return False
     with suppress(RecordingError):  # reported when it is downloaded
         return (location.info() or {}).get("type") == "directory"

@@ -17,7 +17,7 @@ from urllib.parse import unquote
 
 from shapecat.errors import ConfigError, RecordingError, ShapecatError
 
-__all__ = ["Location", "content_key", "is_url", "names_in"]
+__all__ = ["Location", "content_key", "is_url", "names_in", "without_query"]
 
 _T = TypeVar("_T")
 
@@ -55,6 +55,11 @@ def is_url(text: str) -> bool:
     return "://" in text
 
 
+def without_query(url: str) -> str:
+    """Return a URL without its query (http) or version (S3, where names may hold a ``?``)."""
+    return url.partition("?" if url.startswith("http") else "?versionId=")[0]
+
+
 def names_in(url: str) -> tuple[str, str]:
     """Return the names of the parent folder and of the file at a URL, without the query.
 
@@ -62,12 +67,11 @@ def names_in(url: str) -> tuple[str, str]:
 
     Examples
     --------
-    >>> names_in("http://host/my%20day/lab.mcap?key=1"), names_in("s3://lab/100%25/b.bag")
-    (('my day', 'lab.mcap'), ('100%25', 'b.bag'))
+    >>> names_in("http://host/my%20day/lab.mcap?key=1"), names_in("s3://lab/100%25/b?.bag")
+    (('my day', 'lab.mcap'), ('100%25', 'b?.bag'))
     """
-    protocol, _, path = url.partition("://")
-    pure = PurePosixPath(path.partition("?")[0])
-    decode = _decoded if protocol in {"http", "https"} else str
+    pure = PurePosixPath(without_query(url).partition("://")[2])
+    decode = _decoded if url.startswith("http") else str
     return decode(pure.parent.name), decode(pure.name)
 
 
@@ -83,11 +87,9 @@ def content_key(info: Mapping[str, Any]) -> str:
     """
     names = _DIGESTS if any(info.get(name) for name in _DIGESTS) else _TIMES
     values = [info[name] for name in names if info.get(name) is not None]
-    if not values:
-        return ""
     texts = [v.isoformat() if isinstance(v, datetime) else str(v) for v in values]
     content = [info.get("size"), *texts]
-    return sha256(repr(content).encode()).hexdigest()[:16]
+    return sha256(repr(content).encode()).hexdigest()[:16] if values else ""
 
 
 class Location:
