@@ -29,7 +29,8 @@ from shapecat.runs.labels.track_table import (
     write_track_table,
 )
 from shapecat.runs.perceive.perceived import FrameRow, PerceptionTables
-from shapecat.runs.tracks import _CSV, _write_csv
+from shapecat.runs.tracks import _CSV, _line, _write_csv
+from shapecat.tracking.records import Track
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
 from tests.mcap_files import read_ros
 from tests.run_info import run_info
@@ -599,6 +600,19 @@ def test_new_table_with_umlauts_opens_in_a_spreadsheet(tmp_path: Path) -> None:
     _write_csv(tmp_path / "tracks.csv", [line])
 
     assert "Krügel" in opened_in_excel(tmp_path / "tracks.csv")
+
+
+@pytest.mark.parametrize("topic", ["=cmd|'/C calc'!A0", "+1", "-d", "@SUM(1)", "/depth"])
+def test_topic_is_no_formula_in_a_spreadsheet(tmp_path: Path, topic: str) -> None:
+    """Topics of MCAP files may be formulas, which a spreadsheet would run; labels cannot be."""
+    one = np.zeros(1, np.int64)
+    causal = np.ones((1, 1), np.float32)
+    track = Track(1, (topic,), 1, one, one, one, np.zeros((1, 3)), causal, causal[0], 1.0, 0.0)
+    _write_csv(tmp_path / "tracks.csv", [_line(track, ["cup"], 0, "")])
+    (row,) = read_track_table(tmp_path / "tracks.csv").rows
+
+    assert row.topic == topic
+    assert row.cells["topic"][0] in " /"
 
 
 @pytest.mark.parametrize("label", ["चाकू", "น้ำ", "cafe\u0301"])

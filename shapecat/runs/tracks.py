@@ -248,7 +248,8 @@ def _line(track: Track, categories: Sequence[str], start_ns: int, work: str) -> 
         "z": z,
         "novelty": track.novelty,
         "guess": guess,
-        "topic": track.topic,
+        # After a space, which readers strip, a spreadsheet does not take it for a formula.
+        "topic": f" {track.topic}" if track.topic.startswith(("=", "+", "-", "@")) else track.topic,
         "run": work,
     }
 
