@@ -49,6 +49,7 @@ def kernel(
     options = {"nogil": True, "error_model": "numpy", "fastmath": _FAST if fast else False}
 
     def compile_later(target: _F) -> Any:
+        """Return the function as a kernel, which its first call compiles."""
         if inner:
             return register_jitable(**options)(target)
         folder = code_folder(_stage_of(Path(target.__code__.co_filename)))
