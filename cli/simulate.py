@@ -102,12 +102,13 @@ def simulate(
     shapecat simulate demo.mcap --scene clutter --frames 60 --seed 3
     """
     from shapecat.simulation import simulate as write_simulation
-    from shapecat.simulation.files import written_paths
+    from shapecat.simulation.files import require_replaceable, written_paths
 
     container = _format_of(out, container)
     # Even without --color, colour labels of another scene must not remain.
     there = [path for path in written_paths(out, container, color=True) if path.exists()]
     if there and not overwrite:
+        require_replaceable(there[0])
         msg = f"{there[0]} exists already; --overwrite replaces it"
         raise click.UsageError(msg)
     with progress_bars() as bars:

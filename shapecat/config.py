@@ -211,7 +211,7 @@ def with_overrides(settings: Settings, overrides: Sequence[str]) -> Settings:
     changes: dict[str, Any] = {}
     for text in overrides:
         name, equals, value = text.partition("=")
-        if not equals:
+        if not (name.strip() and equals):
             msg = f"--set {text}: expected name=value, for example tracking.gate_m=0.2"
             raise ConfigError(msg)
         tree: Any = _parse_value(value)

@@ -275,6 +275,20 @@ def test_simulate_refuses_suffix_of_another_format(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("options", [(), ("--overwrite",)])
+def test_simulate_offers_to_overwrite_only_recordings(
+    shapecat: Run, tmp_path: Path, options: tuple[str, ...]
+) -> None:
+    """`--overwrite`, which was recommended, then refused the folder."""
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.txt").touch()
+    result = shapecat("simulate", tmp_path / "thesis", "--frames", 1, *options)
+
+    assert result.exit_code == 1
+    assert "a folder that is not a recording; choose another name" in result.stderr
+    assert "--overwrite" not in result.stderr
+
+
 @pytest.mark.parametrize("folder", [".", "/", "..", "a/.."])
 def test_simulate_needs_name_of_recording(
     shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str

@@ -1475,6 +1475,16 @@ def test_errors_are_one_line_with_reason_and_exit_code(
         assert text in refused(shapecat, *words)[1]
 
 
+def test_labels_of_another_topic_are_named(run: Path, tmp_path: Path) -> None:
+    """The message listed the same timestamps for both, and left out what differs."""
+    image = {"id": 1, "height": 3, "width": 4, "stamp_ns": START, "topic": "/left"}
+    content = {"categories": [], "annotations": [], "images": [image]}
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+
+    with pytest.raises(RecordingError, match=f"images {START} to {START} of /left, the run .* of "):
+        compare(run, tmp_path / "coco.json")
+
+
 @pytest.mark.parametrize("place", [".", "/"])
 def test_folder_without_a_name_is_not_a_reference(shapecat: Run, run: Path, place: str) -> None:
     """A person in a folder of labels that shapecat cannot read gets a reason, no traceback."""
@@ -1637,4 +1647,4 @@ def test_run_with_frames_in_another_order_is_refused(run: Path) -> None:
     assert other.at(last_key, last) is not None
     with pytest.raises(OutputError, match="its frames are in a different order; process it again"):
         other.at(first_key, first)
-    assert other.describe_frames() == f"frames of {first_key[0]}, stamps {first} to {last}"
+    assert other.describe_frames() == f"frames with stamps {first} to {last} of {first_key[0]}"

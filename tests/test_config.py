@@ -95,6 +95,7 @@ def test_numbers_of_numpy_are_settings() -> None:
         ("surface.smooth_radius_m=1.0", "to 0.1, got 1.0"),
         ("surface.smooth_radius_m=1e-9", "if not 0, must be from 0.0001"),
         ("tracking.gate_m", "expected name=value"),
+        ("=1", "--set =1: expected name=value"),
     ],
 )
 def test_error_names_invalid_setting(override: str, message: str) -> None:

@@ -16,7 +16,7 @@ from shapecat.simulation.containers import CONTAINERS
 from shapecat.system.files import flush
 from shapecat.types import Camera
 
-__all__ = ["LabelFile", "completed", "written_paths"]
+__all__ = ["LabelFile", "completed", "require_replaceable", "written_paths"]
 
 
 def written_paths(out: Path, format: str, *, color: bool = False) -> list[Path]:  # noqa: A002  the word users know
@@ -44,7 +44,7 @@ def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[li
     """
     out = paths[0]
     try:
-        _require_replaceable(out)
+        require_replaceable(out)
         with explained(f"{out}: cannot write the recording", OutputError):
             out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=".simulated-") as hidden:
@@ -60,7 +60,7 @@ def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[li
         raise OutputError(msg) from error
 
 
-def _require_replaceable(path: Path) -> list[Path]:
+def require_replaceable(path: Path) -> list[Path]:
     """Return the files of a folder that a recording may replace; none if it is not a folder.
 
     Raises
@@ -79,9 +79,9 @@ def _move(hidden_path: Path, path: Path) -> None:
 
     Raises
     ------
-    OutputError : as for `_require_replaceable`.
+    OutputError : as for `require_replaceable`.
     """
-    for file in _require_replaceable(path):
+    for file in require_replaceable(path):
         file.unlink()
     if path.is_dir() and not path.is_symlink():
         path.rmdir()

@@ -148,7 +148,8 @@ def _require_same_recording(finished: FinishedRun, other: OtherRun) -> None:
 
 def _nothing_in_common(finished: FinishedRun, reference: Path, other: Reference[Any]) -> str:
     stamps = [row["stamp_ns"] for _, row, _ in run_labellings(finished)]
-    own = f"stamps {min(stamps)} to {max(stamps)}" if stamps else "none"
+    topics = ", ".join(finished.info["options"]["topics"])
+    own = f"stamps {min(stamps)} to {max(stamps)} of {topics}" if stamps else "none"
     return (
         f"{reference}: no frame in common with {finished.folder}: it has "
         f"{other.describe_frames()}, the run {own}; is it from another recording?"

@@ -160,9 +160,13 @@ class Reference(ABC, Generic[_Frame]):
         """Return the objects of a frame; errors are as for `at`."""
 
     def describe_frames(self) -> str:
-        """Describe the range of frames in a few words."""
+        """Describe the range of frames, and their topics if they are known, in a few words."""
         numbers = [number for _, number, _ in self._index]
-        return f"{self.unit} {min(numbers)} to {max(numbers)}" if numbers else f"no {self.unit}"
+        topics = ", ".join(sorted({str(topic) for topic, *_ in self._index if topic is not None}))
+        where = f" of {topics}" if topics else ""
+        return (
+            f"{self.unit} {min(numbers)} to {max(numbers)}{where}" if numbers else f"no {self.unit}"
+        )
 
 
 def numbering_notes(other: Reference[Any], start_s: float | None) -> list[str]:

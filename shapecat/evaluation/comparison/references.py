@@ -191,7 +191,7 @@ def _image_shape(file: IO[bytes]) -> tuple[int, int, int]:
 class OtherRun(Reference[Key]):
     """Another run of the same recording, whose final labels count as the truth."""
 
-    kind, unit, tracked = "another run", "stamps", True
+    kind, unit, tracked = "another run", "frames with stamps", True
 
     def __init__(self, folder: Path) -> None:
         self.finished = read_complete(folder)
@@ -212,11 +212,6 @@ class OtherRun(Reference[Key]):
                 return labelling
         msg = f"{self.finished.folder}: its frames are in a different order; process it again"
         raise OutputError(msg)
-
-    def describe_frames(self) -> str:
-        """Return the topics and the range of timestamps."""
-        topics = ", ".join(sorted({str(topic) for topic, *_ in self._index}))
-        return f"frames of {topics}, {super().describe_frames()}" if topics else "no frames"
 
 
 def repeated_stamps(folder: Path) -> set[tuple[str, int]]:
