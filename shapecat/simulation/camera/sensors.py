@@ -98,7 +98,11 @@ def _mixed(first: Any, second: Any, share: float) -> Any:
 
 
 def resized(sensor: Sensor, scale: float) -> Sensor:
-    """Return a sensor with ``scale`` times the width and height, and the same field of view."""
+    """Return a sensor with ``scale`` times the width and height, and the same field of view.
+
+    ``border_px`` stays: another border would change the scenes that the default model and the
+    rejection trees were trained on.
+    """
     camera = sensor.camera
     middle = [(c + 0.5) * scale - 0.5 for c in (camera.cx, camera.cy)]
     focal = camera.fx * scale, camera.fy * scale
