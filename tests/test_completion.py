@@ -288,6 +288,25 @@ def test_view_of_moved_object_keeps_its_pose() -> None:
     assert_allclose(fused.std[2], 0.01 * np.sqrt(0.5 + 0.5 / 5))
 
 
+def test_guessed_length_is_the_uncertain_one() -> None:
+    """With the deviations of length and width swapped, users would trust the guessed depth."""
+    points, normals = cylinder(0.05, 0.12)
+    side = normals[:, 2] == 0
+    turn = about_z(np.arctan2(PLACE[1], PLACE[0]))  # the longer axis is that of the sight
+    box = estimate(points[side] * [1.15, 1, 1] @ turn.T, normals[side] @ turn.T, "bottle")
+    axes = LEVEL @ rotation_from_quaternion(box.orientation)
+    views = BoxViews(
+        *(np.tile(value, (3, *[1] * np.ndim(value))) for value in (LEVEL @ box.center, axes)),
+        *(np.tile(value, (3, 1)) for value in (box.size, box.size_std, box.outline, np.zeros(3))),
+    )
+    fused = fuse_boxes(views, np.ones(3), one_hot("bottle"), CATEGORIES)
+    depth = int(abs(PLACE[:2] @ axes[:2, :2]).argmax())
+    fused_depth = int(abs(PLACE[:2] @ fused.axes[:2, :2]).argmax())
+
+    assert box.size_std[depth] > 1.5 * box.size_std[1 - depth]
+    assert fused.std[fused_depth] > 1.5 * fused.std[1 - fused_depth]
+
+
 def test_box_of_object_at_rest_does_not_turn_with_the_noise_of_its_yaw() -> None:
     """Seen from two sides, the yaw of a box may be off by eight degrees each way."""
     yaws = np.radians(np.where(np.arange(24) < 12, 30.0 - 8, 30.0 + 8))
