@@ -69,8 +69,8 @@ def seen_at(k: int, objects: tuple[LabelledObject, ...], pixels: Any) -> ReviewF
     image = ColourImage("/color", stamp(k), stamp(k), "optical", "png", 8, 6, 0, png(pixels))
     pose = Pose(TURNS[k].as_matrix(), PLACES[k])
     labelled = LabelledFrame(
-        TOPIC, k, stamp(k), stamp(k), "optical", pose, PLANES, objects, (), {"detect": 0.02 + k},
-        np.array([0, -1, 0]),
+        TOPIC, k, stamp(k), stamp(k) + 7, "optical", pose, PLANES, objects, (),
+        {"detect": 0.02 + k}, np.array([0, -1, 0]),
     )  # fmt: skip
     return ReviewFrame(labelled, frame, Coloured(ColourView(image), MASKS[: len(objects)]))
 
@@ -183,6 +183,24 @@ def test_sensor_and_scene_are_at_the_pose_of_the_frame(shown: dict[str, Any]) ->
         image_from_camera=[[9, 0, 0, 0, 7, 0, 3.2, 2.9, 1]],
         color=[packed((120, 130, 145))], image_plane_distance=[0.06],
     )  # fmt: skip
+
+
+def test_every_row_has_the_stamp_of_its_frame(tmp_path: Path, pixels: Any) -> None:
+    """At its log time, a box would be drawn before or after the image in which it was found."""
+    from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
+
+    run = {"fixed_frame": "map", "settings": {"outputs": {"cloud_points": 0}}}
+    frames = [seen_at(k, items(), pixels) for k in range(2)]
+    chunks = RrdReader(str(write_frames(tmp_path / "review.rrd", frames, run=run))).stream()
+    found = {
+        (str(chunk.entity_path), row["sensor_time"] - stamp(row["frame"]))
+        for chunk in chunks.to_chunks()
+        for row in as_rows(chunk.to_record_batch())
+        if row.get("frame") is not None
+    }
+
+    assert len(found) > 15  # entities
+    assert {late_ns for _, late_ns in found} == {0}
 
 
 def test_path_is_in_the_fixed_frame(shown: dict[str, Any]) -> None:
