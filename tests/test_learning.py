@@ -191,7 +191,7 @@ def test_unknown_shapes_are_more_novel_than_known_ones(categorizer: Categorizer)
     known = categorizer.predict(blobs(100, 6).descriptors).novelty
     unknown = categorizer.predict(blobs(100, 6, (UNKNOWN,)).descriptors).novelty
 
-    assert np.mean(known > 1) < 0.15  # 5 % on the held-out views by construction
+    assert np.mean(known > 1) < 0.08  # 5 % on the held-out views by construction
     assert np.mean(unknown > 1) > 0.8
 
 
