@@ -382,12 +382,34 @@ def test_unread_colour_is_reported(tmp_path: Path, kind: str) -> None:
         items.append(("/cam/color/image_raw", EPOCH, packed(EPOCH, b"\0\0\0\1g", kind)))
     path = write(tmp_path / "a.mcap", items)
     with open_recording(path) as recording:
-        if kind.startswith("foxglove"):
+        if kind.startswith(("foxglove", "theora")):
             recording.topics += (Topic("/cam/color/image_raw", kind, "protobuf", 1),)
         assert not pair_colours(recording, choose_streams(recording, ["/cam/depth/image_raw"]))
         (warning,) = recording.warnings
 
     assert warning == f"/cam/color/image_raw: there is no colour, since {kind} cannot be read"
+
+
+def test_unread_colour_is_reported_beside_another_camera(tmp_path: Path) -> None:
+    """The images of another camera hid that those of the depth camera cannot be read.
+
+    They were paired with its depth if there was no other depth camera.
+    """
+    other = ("/web/image_raw", EPOCH, raw(EPOCH, gradient(), "rgb8", "web"))
+    nv12 = raw(EPOCH, np.zeros((48, 64), np.uint8), "nv12", "color_optical")
+    items = [*depth_items(EPOCH), ("/cam/color/image_raw", EPOCH, nv12), other]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        assert not pair_colours(recording, choose_streams(recording))
+        (warning,) = recording.warnings
+
+    assert warning == "/cam/color/image_raw: there is no colour, since nv12 cannot be read"
+
+    second = depth_items(EPOCH, frame_id="b_optical")
+    items += [(topic.replace("/cam/", "/b/"), *rest) for topic, *rest in second]
+    items.append(("/b/color/image_raw", EPOCH, other[2]))
+    with open_recording(write(tmp_path / "b.mcap", items)) as recording:
+        assert list(pair_colours(recording, choose_streams(recording, ["/b/depth/image_raw"])))
+        assert not recording.warnings  # the images of the other camera are not needed
 
 
 def test_damaged_images_are_skipped_and_reported(tmp_path: Path) -> None:

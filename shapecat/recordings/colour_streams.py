@@ -30,8 +30,8 @@ from shapecat.recordings.streams import (
 __all__ = ["ColourStream", "colour_streams", "pair_colours"]
 
 _COLOUR_WORDS = ("color", "colour", "rgb")
-_VIDEO = ("CompressedVideo", "FFMPEGPacket")
-"""Endings of the message types of videos, which cannot be read."""
+_VIDEO = ("CompressedVideo", "Packet")
+"""Endings of the message types of videos, as of FFmpeg and Theora, which cannot be read."""
 _OTHER_WORDS = ("infra", "/ir/", "depth/image", "confidence", "thermal", "mask")
 """Grey images on topics with these words are not from a colour camera."""
 
@@ -80,7 +80,8 @@ def pair_colours(
     have the same frame. They also do if the topic names begin with the same namespace
     (``/camera/color/image_raw`` and ``/camera/depth/image_raw``), unless their topic shares more of
     its namespace with another depth sensor. If a recording has one depth sensor and one stream of
-    colour images, raw or compressed or both, they belong together whatever their names.
+    colour images, raw or compressed or both, they belong together whatever their names, unless
+    images that cannot be read belong to the sensor.
 
     Among several streams, the preference is, in this order: the same frame, the longest common
     namespace, a topic named after colour, rectified images, more messages, compressed images, the
@@ -94,8 +95,8 @@ def pair_colours(
     Returns
     -------
     The colour stream of each depth topic that has one. If its ``info_topic`` is that of the depth
-    stream, it is replaced by None. If the recording has no colour stream, there is a warning for
-    each topic of colour that cannot be read.
+    stream, it is replaced by None. If a depth stream has none, there is a warning for each topic of
+    colour that belongs to it, or of all if the recording has no colour stream, and cannot be read.
 
     Raises
     ------
@@ -108,8 +109,6 @@ def pair_colours(
         chosen = dict.fromkeys((one.topic for one in streams), _select(recording, found, requested))
     else:
         chosen = _choose(recording, streams, found)
-        if not found:
-            _warn_about_unread(recording)
     infos = {stream.topic: stream.info_topic for stream in streams}
     return {
         topic: replace(one, info_topic=None) if one.info_topic == infos[topic] else one
@@ -120,35 +119,54 @@ def pair_colours(
 def _choose(
     recording: Recording, streams: Sequence[Stream], found: Sequence[ColourStream]
 ) -> dict[str, ColourStream]:
-    """Return the best colour stream in ``found`` for each depth topic that has one."""
+    """Return the best colour stream in ``found`` for each depth topic that has one.
+
+    If one has none, warn about its images and videos that cannot be read.
+    """
     images = [one for one in found if one.kind != "cloud" and not one.grey]
-    sensors = by_sensor(depth_streams(recording)) if images else []
-    nearest = {one.topic: _nearest_sensors(one, sensors) for one in images}
+    unread = _unread(recording, found)
+    sensors = by_sensor(depth_streams(recording)) if images or unread else []
+    nearest = {one.topic: _nearest_sensors(one, sensors) for one in (*images, *unread)}
     single = len({one.topic.removesuffix("/compressed") for one in images}) == 1
     chosen = {}
     for stream in streams:
         own = [one for one in found if one.kind == "cloud" and one.topic == stream.topic]
         fitting = own or [one for one in images if _belongs(one, stream, nearest[one.topic])]
-        if not fitting and single and len(sensors) == 1:
+        missed = [one for one in unread if _belongs(one, stream, nearest[one.topic])]
+        if not fitting and single and len(sensors) == 1 and not missed:
             fitting = images
         if fitting:
             chosen[stream.topic] = min(fitting, key=partial(_rank, stream=stream))
+            continue
+        for one in missed if found else unread:
+            recording.warn(f"{one.topic}: there is no colour, since {one.encoding} cannot be read")
     return chosen
 
 
-def _warn_about_unread(recording: Recording) -> None:
-    """Warn about topics named after colour whose images or videos cannot be read."""
+def _unread(recording: Recording, found: Sequence[ColourStream]) -> list[ColourStream]:
+    """Return the topics named after colour whose images or videos cannot be read.
+
+    Their ``encoding`` is that of the images, or the type of the messages of a video. ``found`` are
+    the streams that can be read.
+    """
+    unread = []
+    known = {one.topic for one in found}
     for topic in recording.topics:
-        if topic.count == 0 or not any(word in topic.name.lower() for word in _COLOUR_WORDS):
+        named = any(word in topic.name.lower() for word in _COLOUR_WORDS)
+        is_image = ros_counterpart(topic.type) in {IMAGE, COMPRESSED}
+        is_video = topic.type.endswith(_VIDEO)
+        if not named or not topic.count or topic.name in known or not (is_image or is_video):
             continue
-        kind = ros_counterpart(topic.type)
-        name = topic.type if topic.type.endswith(_VIDEO) else ""
-        if kind in {IMAGE, COMPRESSED}:
-            first = next(first_messages(recording, topic.name, topic.type), None)
+        first = next(first_messages(recording, topic.name, topic.type), None)
+        name = topic.type
+        if is_image:
             name = str(getattr(first, "encoding", getattr(first, "format", ""))).strip()
-            name = "" if name.startswith(tuple(DEPTH_ENCODINGS)) else name
-        if name:
-            recording.warn(f"{topic.name}: there is no colour, since {name} cannot be read")
+        if name and not name.startswith(tuple(DEPTH_ENCODINGS)):
+            frame_id = str(getattr(getattr(first, "header", None), "frame_id", ""))
+            unread.append(
+                ColourStream(topic.name, topic.type, "raw", None, topic.count, frame_id, name)
+            )
+    return unread
 
 
 class _NearSensor(NamedTuple):
