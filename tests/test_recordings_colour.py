@@ -354,7 +354,10 @@ def test_images_kept_for_late_depth_are_limited_in_bytes(
 
 @pytest.mark.parametrize("bare", [0, 2])
 def test_missing_stamps_are_estimated_in_simulated_time(tmp_path: Path, bare: int) -> None:
-    """Simulated time begins near 0; with the log time as stamp, objects would get new tracks."""
+    """Simulated time begins near 0; with the log time as stamp, objects would get new tracks.
+
+    The estimate is not exact: masks may be displaced, which must be said.
+    """
     expected = [7 + k * SECOND for k in range(4)]
     items = depth_items(*expected)
     items += [("/cam/color/image_raw", t + 9, raw(t, gradient(), "rgb8")) for t in expected]
@@ -362,13 +365,18 @@ def test_missing_stamps_are_estimated_in_simulated_time(tmp_path: Path, bare: in
         if message.header.stamp.sec == bare:
             message.header = header(0, message.header.frame_id)
     logged = [(topic, EPOCH + time, message) for topic, time, message in in_order(items)]
-    pairs, _ = read(write(tmp_path / "a.mcap", logged))
+    pairs, warnings = read(write(tmp_path / "a.mcap", logged))
 
     assert [frame.stamp_ns for frame, _ in pairs] == expected
     assert [view and view.image.stamp_ns for _, view in pairs] == expected
+    estimated = "header.stamp is 0 (1×): it is estimated from the log time"
+    topics = "/cam/depth/image_raw", "/cam/color/image_raw"
+    assert {f"{topic}: {estimated}" for topic in topics} <= set(warnings)
 
 
-@pytest.mark.parametrize("kind", ["nv12", "h264", "foxglove.CompressedVideo"])
+@pytest.mark.parametrize(
+    "kind", ["nv12", "h264", "foxglove.CompressedVideo", "theora_image_transport/msg/Packet"]
+)
 def test_unread_colour_is_reported(tmp_path: Path, kind: str) -> None:
     """Users did not learn that their recording has colour that cannot be read."""
     items = [

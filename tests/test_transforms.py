@@ -435,17 +435,29 @@ def test_mixed_up_poses_of_two_robots_are_reported(tmp_path: Path) -> None:
 
 
 def test_transforms_without_stamps_use_log_times(tmp_path: Path) -> None:
-    """Images without stamps use log times, too; otherwise they would find no transform."""
+    """Images without stamps use log times, too; otherwise they would find no transform.
+
+    The poses of other images are late, which nothing said.
+    """
     items = [("/tf", EPOCH + k * SECOND, stamped("odom", "base", float(k), 0)) for k in range(3)]
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         buffer = read_transforms(recording)
+        (warning,) = recording.warnings
 
     assert buffer.lookup("odom", "base", EPOCH + SECOND // 2).translation[0] == 0.5
+    assert warning == (
+        "/tf: transforms have no stamps: their log times, which are later, replace them"
+    )
 
 
-def test_missing_stamps_of_transforms_are_in_the_clock_of_the_others(tmp_path: Path) -> None:
-    """A simulation begins at 0, and its first pose was taken for one at the log time."""
-    clock = 3 * SECOND  # the log time is not that of the simulation
+@pytest.mark.parametrize("clock", [0, 3 * SECOND])
+def test_missing_stamps_of_transforms_are_in_the_clock_of_the_others(
+    clock: int, tmp_path: Path
+) -> None:
+    """A simulation begins at 0, and its first pose was taken for one at the log time.
+
+    That may be the time of the simulation (``clock`` is 0), or not.
+    """
     items = [
         ("/tf", clock + stamp, stamped("odom", "base", x, stamp))
         for x, stamp in ((1.0, 0), (2.0, SECOND // 10))
@@ -453,6 +465,7 @@ def test_missing_stamps_of_transforms_are_in_the_clock_of_the_others(tmp_path: P
     items.insert(0, ("/tf", clock, stamped("odom", "lidar", 7.0, 0)))
     with open_recording(write(tmp_path / "a.mcap", items)) as recording:
         buffer = read_transforms(recording)
+        assert not recording.warnings
 
     assert buffer.lookup("odom", "base", SECOND // 20).translation[0] == 1.5
     assert buffer.lookup("odom", "lidar", 0).translation[0] == 7.0

@@ -239,7 +239,11 @@ class _Partner:
             return None
 
     def report(self) -> None:
-        """Add a warning with a count for each reason why messages or frames were left out."""
+        """Add a warning with a count for each reason why messages or frames were left out.
+
+        Missing stamps are counted, too.
+        """
+        self._clock.report(missing_only=True)
         counts = {"unreadable messages": self._unreadable, "frames without colour": self._without}
         for what, reasons in counts.items():
             for reason, count in reasons.items():

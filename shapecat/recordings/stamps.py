@@ -37,17 +37,25 @@ class Estimates:
     """Estimates missing stamps: the log time minus the delay of the first message with a stamp.
 
     That works for any clock, such as one that counts from the start of a simulation.
+
+    Attributes
+    ----------
+    unknown : the topics whose first messages have no stamp; the log time replaces theirs.
     """
 
     def __init__(self, recording: Recording) -> None:
         """Prepare estimates; a topic is searched when a stamp is missing for the first time."""
         self._recording = recording
         self._delays: dict[str, int] = {}
+        self.unknown: set[str] = set()
 
     def stamp_ns(self, topic: str, log_time_ns: int) -> int:
         """Return an estimate of a message's stamp, ns; the log time if no stamp was found."""
         if topic not in self._delays:
-            self._delays[topic] = next(self._delays_of(topic), 0)
+            delay = next(self._delays_of(topic), None)
+            if delay is None:
+                self.unknown.add(topic)
+            self._delays[topic] = delay or 0
         return max(log_time_ns - self._delays[topic], 0)
 
     def _delays_of(self, topic: str) -> Iterator[int]:
@@ -87,10 +95,10 @@ class Clock:
         self.last, self.delay = stamp, delay
         return stamp
 
-    def report(self) -> None:
-        """Add warnings about suspicious stamps to the recording."""
+    def report(self, *, missing_only: bool = False) -> None:
+        """Add warnings about suspicious stamps, or only about missing ones, to the recording."""
         for name, count in self.counts.items():
-            if count:
+            if count and (name == "zero" or not missing_only):
                 self.recording.warn(f"{self.topic}: {_TEXTS[name].format(count)}")
 
 

@@ -62,6 +62,11 @@ class TransformReader:
                 times = stamp, message.log_time_ns
                 if not self._add(transform, times, static=static, latched=latched):
                     self._recording.warn("skipped invalid transforms (NaN, no name)")
+                if message.topic in self._estimates.unknown:
+                    self._recording.warn(
+                        f"{message.topic}: transforms have no stamps: their log times, which are "
+                        "later, replace them"
+                    )
                 if not static:
                     self.lag_ns = max(self.lag_ns, abs(stamp - message.log_time_ns))
         except (RecordingError, *MALFORMED) as error:
