@@ -352,6 +352,54 @@ def test_images_kept_for_late_depth_are_limited_in_bytes(
     assert [v and v.image.stamp_ns for _, v in pairs] == [None, times[8]]
 
 
+def late_images(path: Path, ahead_ms: int, late_ms: int) -> Path:
+    """Write depth and colour images at 30 Hz with the same times, but another clock or log time."""
+    items = []
+    for time in (EPOCH + 33 * k * MS for k in range(40)):
+        items += depth_items(time)
+        colours = raw(time + ahead_ms * MS, gradient(), "rgb8")
+        items.append(("/cam/color/image_raw", time + late_ms * MS, colours))
+    return write(path, in_order(items))
+
+
+def test_frames_wait_half_a_second_for_late_colour(tmp_path: Path) -> None:
+    """Colour over a slow network was missing in all frames but the last few.
+
+    Only eight frames waited, which is a quarter of a second at 30 Hz.
+    """
+    pairs, warnings = read(late_images(tmp_path / "a.mcap", 0, 450))
+
+    assert [view and view.image.stamp_ns for _, view in pairs] == [f.stamp_ns for f, _ in pairs]
+    assert not warnings
+
+
+@pytest.mark.parametrize(
+    ("ahead_ms", "late_ms", "difference"),
+    [(500, 0, "0.50 s ahead of"), (-500, 0, "0.50 s behind"), (0, 700, "0.70 s behind")],
+)
+def test_colour_of_another_clock_is_reported(
+    ahead_ms: int, late_ms: int, difference: str, tmp_path: Path
+) -> None:
+    """Users saw images in the recording, but only heard that there is none near the frames."""
+    _, warnings = read(late_images(tmp_path / "a.mcap", ahead_ms, late_ms))
+
+    (warning,) = (text for text in warnings if "at the same log time" in text)
+    assert warning.startswith(
+        f"/cam/color/image_raw: its stamps are {difference} those of /cam/depth/image_raw "
+    )
+
+
+def test_end_of_colour_is_no_other_clock(tmp_path: Path) -> None:
+    """In a slow simulation, delays grow, and later frames have others than the last image."""
+    items = depth_items(*(EPOCH + 33 * k * MS for k in range(40)))
+    colours = [raw(EPOCH + 33 * k * MS, gradient(), "rgb8") for k in range(10)]
+    items += [("/cam/color/image_raw", EPOCH + 33 * k * MS, c) for k, c in enumerate(colours)]
+    slow = [(topic, EPOCH + 10 * (time - EPOCH), message) for topic, time, message in items]
+    _, (warning,) = read(write(tmp_path / "a.mcap", in_order(slow)))
+
+    assert "frames without colour (30×)" in warning
+
+
 @pytest.mark.parametrize("bare", [0, 2])
 def test_missing_stamps_are_estimated_in_simulated_time(tmp_path: Path, bare: int) -> None:
     """Simulated time begins near 0; with the log time as stamp, objects would get new tracks.

@@ -32,8 +32,8 @@ from shapecat.types import Camera, Frame
 
 __all__ = ["KnownImages", "frames_with_colour"]
 
-_HELD_FRAMES = 8
-"""Maximum number of frames that wait for a later colour image."""
+_HELD_FRAMES = 32
+"""Maximum number of frames that wait for a later colour image: half a second of two cameras."""
 _KEPT_IMAGES = 64
 """Maximum number of colour images kept for later frames. A frame may be logged a second after its
 image, and cameras give up to 60 images per second."""
@@ -231,6 +231,7 @@ class _Partner:
         nearest = min(candidates, key=lambda one: abs(one.stamp_ns - frame.stamp_ns), default=None)
         if nearest is None:
             self._without["no colour image near the time of the frame"] += 1
+            self._clock.compare(frame.topic, frame.stamp_ns, frame.log_time_ns)
             return None
         try:
             return self._view(frame, nearest)
@@ -239,11 +240,8 @@ class _Partner:
             return None
 
     def report(self) -> None:
-        """Add a warning with a count for each reason why messages or frames were left out.
-
-        Missing stamps are counted, too.
-        """
-        self._clock.report(missing_only=True)
+        """Add warnings: unusable stamps, and each reason why messages or frames were left out."""
+        self._clock.report(colour=True)
         counts = {"unreadable messages": self._unreadable, "frames without colour": self._without}
         for what, reasons in counts.items():
             for reason, count in reasons.items():

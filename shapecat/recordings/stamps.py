@@ -1,8 +1,10 @@
 """Read the stamps of messages, and warn about unreliable clocks."""
 
+from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from itertools import islice
+from statistics import median
 from typing import Any
 
 from shapecat.recordings.messages import MALFORMED, MessageError
@@ -12,8 +14,14 @@ __all__ = ["Clock", "Estimates", "stamp_ns"]
 
 _EPOCH_NS = 946_684_800 * 10**9
 """1 January 2000: earlier stamps probably count from when the sensor was switched on."""
+_DIFFERENT_S = 0.3
+"""Smallest difference from the delay of another topic that is reported. Drivers' differ by less."""
 _JUMP_NS = 10 * 10**9
 """Smallest change of the delay between stamp and log time that counts as a jump."""
+_COMPARED = 64
+"""Number of the latest comparisons with another topic on which a warning is based."""
+_ENDED_NS = 100_000_000
+"""A topic may have ended if its last message was logged this long before that of another topic."""
 _FIRST = 20
 """Number of messages of a topic that `Estimates` searches for stamps. A simulation begins at 0, and
 so do the stamps of its first transforms."""
@@ -77,6 +85,8 @@ class Clock:
         self.last: int | None = None
         self.delay: int | None = None
         self.counts = dict.fromkeys(_TEXTS, 0)
+        self.other = ""
+        self._ahead: deque[int] = deque(maxlen=_COMPARED)
         self._estimates = Estimates(recording)
 
     def check(self, stamp: int, log_time: int) -> int:
@@ -95,11 +105,34 @@ class Clock:
         self.last, self.delay = stamp, delay
         return stamp
 
-    def report(self, *, missing_only: bool = False) -> None:
-        """Add warnings about suspicious stamps, or only about missing ones, to the recording."""
+    def compare(self, topic: str, stamp: int, log_time: int) -> None:
+        """Compare the latest delay with that of a message on another topic, nanoseconds.
+
+        There is none once this topic may have ended: in a slow simulation, delays grow.
+        """
+        if self.last is None or self.delay is None:
+            return
+        if log_time - self.last - self.delay < _ENDED_NS:
+            self.other = topic
+            self._ahead.append(log_time - stamp - self.delay)
+
+    def report(self, *, colour: bool = False) -> None:
+        """Add warnings about suspicious stamps to the recording.
+
+        Of the stamps of ``colour`` images, only missing ones are suspicious, and those far from the
+        other topic's.
+        """
+        names = {"zero"} if colour else set(_TEXTS)
         for name, count in self.counts.items():
-            if count and (name == "zero" or not missing_only):
+            if count and name in names:
                 self.recording.warn(f"{self.topic}: {_TEXTS[name].format(count)}")
+        ahead_s = median(self._ahead or [0]) * 1e-9
+        if abs(ahead_s) > _DIFFERENT_S:
+            side = "ahead of" if ahead_s > 0 else "behind"
+            self.recording.warn(
+                f"{self.topic}: its stamps are {abs(ahead_s):.2f} s {side} those of {self.other} "
+                "at the same log time: synchronize the clocks of the computers, or record it sooner"
+            )
 
 
 _TEXTS = {
