@@ -541,6 +541,19 @@ def test_clock_counts_each_kind_of_fault() -> None:
     assert clock.counts == {"zero": 1, "epoch": 1, "same": 1, "back": 3, "jump": 2}
 
 
+@pytest.mark.parametrize("simulated", [False, True])
+def test_simulated_time_is_not_suspicious(simulated: bool) -> None:
+    """Every recording of a simulation, in which all is well, had a warning."""
+    topics = (Topic("/clock", "rosgraph_msgs/msg/Clock", "cdr", 1),) if simulated else ()
+    warnings: list[str] = []
+    recording: Any = SimpleNamespace(topics=topics, warn=warnings.append)
+    clock = Clock(recording, "/t")
+    clock.check(7 * SECOND, EPOCH)
+    clock.report()
+
+    assert len(warnings) == (not simulated)
+
+
 def test_overlapping_chunks_are_merged_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ties keep the order of the file; a chunk is opened when it is due and there is room."""
     chunks = {0: [50, 60], 1: [20, 30, 40], 2: [10, 30, 50], 3: [15, 70]}

@@ -22,6 +22,8 @@ _COMPARED = 64
 """Number of the latest comparisons with another topic on which a warning is based."""
 _ENDED_NS = 100_000_000
 """A topic may have ended if its last message was logged this long before that of another topic."""
+_SIMULATED = "rosgraph_msgs/msg/Clock"
+"""Type of the messages with the time of a simulation."""
 _FIRST = 20
 """Number of messages of a topic that `Estimates` searches for stamps. A simulation begins at 0, and
 so do the stamps of its first transforms."""
@@ -119,10 +121,12 @@ class Clock:
     def report(self, *, colour: bool = False) -> None:
         """Add warnings about suspicious stamps to the recording.
 
-        Of the stamps of ``colour`` images, only missing ones are suspicious, and those far from the
-        other topic's.
+        Simulated time is not suspicious if the recording has the clock of the simulation. Of the
+        stamps of ``colour`` images, only missing ones are, and those far from the other topic's.
         """
         names = {"zero"} if colour else set(_TEXTS)
+        if any(topic.type == _SIMULATED for topic in self.recording.topics):
+            names.discard("epoch")
         for name, count in self.counts.items():
             if count and name in names:
                 self.recording.warn(f"{self.topic}: {_TEXTS[name].format(count)}")
