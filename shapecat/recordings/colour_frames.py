@@ -43,6 +43,9 @@ _STAMP_BYTES = 12
 """Bytes of a ROS message up to the end of its stamp. Calibrations are compared without these."""
 _PATIENCE_NS = 500_000_000
 """Maximum log time that a frame waits for a colour image, nanoseconds."""
+_REACH = 0.6
+"""Maximum time between a frame and its image, in periods of the images: more than half, since
+frames may fall midway between images that are not exactly a period apart."""
 _USUAL_PERIOD_NS = 100_000_000
 """Period assumed for a colour stream if it has too few messages to measure one, nanoseconds."""
 KnownImages: TypeAlias = Callable[[str, int], int | None] | None
@@ -73,7 +76,7 @@ def frames_with_colour(
     Yields
     ------
     Each frame with its colour image: the one that ``same_images`` names or, without it, the one
-    with the nearest stamp, at most half a period of the colour stream away. None replaces an image
+    with the nearest stamp, at most 0.6 periods of the colour stream away. None replaces an image
     that is missing, unreadable, or without a calibration or a transform. Unless ``needed`` is
     given, a warning counts the frames without an image.
     """
@@ -219,8 +222,8 @@ class _Partner:
         if self._same_images is not None:
             logged = self._same_images(frame.topic, frame.index)
             return [one for one in self._images if one.log_time_ns == logged]
-        period = self._period()
-        close = [one for one in self._images if 2 * abs(one.stamp_ns - frame.stamp_ns) <= period]
+        reach = _REACH * self._period()
+        close = [one for one in self._images if abs(one.stamp_ns - frame.stamp_ns) <= reach]
         # After the clock was set back, stamps repeat: leave out images from before.
         closest = min(close, key=lambda one: abs(one.log_time_ns - frame.log_time_ns), default=None)
         return [one for one in close if closest is None or one.setbacks == closest.setbacks]
