@@ -145,6 +145,21 @@ def test_slash_before_a_frame_does_not_make_it_another(tmp_path: Path) -> None:
         assert not recording.warnings
 
 
+@pytest.mark.parametrize("count", [2, 5])
+def test_throttled_depth_is_not_preferred(tmp_path: Path, count: int) -> None:
+    """Depth that is throttled for a network has few frames; the others were lost in silence."""
+    topics = "/cam/depth/image_rect_raw", "/cam/aligned_depth_to_color/image_raw"
+    items: list[Item] = []
+    for topic, number in zip(topics, (count, 6), strict=True):
+        pair = depth_and_info(topic, f"{topic.rpartition('/')[0]}/camera_info")
+        items += [pair[0], *number * [pair[1]]]
+
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        (chosen,) = choose_streams(recording)
+
+    assert (chosen.topic, chosen.count) == ((topics[0], 5) if count == 5 else (topics[1], 6))
+
+
 @pytest.mark.parametrize("other", ["aligned_depth_to_color/image_raw", "depth/color/points"])
 def test_stream_with_calibration_of_another_camera_is_chosen_last(
     tmp_path: Path, other: str

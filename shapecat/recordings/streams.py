@@ -73,9 +73,9 @@ def choose_streams(recording: Recording, requested: Sequence[str] = ()) -> tuple
 
     `by_sensor` says which streams belong to the same sensor. Within a sensor the preference is, in
     this order: no doubt about content or calibration; depth images, since a cloud holds the same
-    data in eight times the bytes; images on a topic named after depth; images not aligned to
-    another camera; more messages; the alphabetical order. A doubt about a chosen stream causes a
-    warning.
+    data in eight times the bytes; images on a topic named after depth; at least half the messages
+    of any other stream of that kind; images not aligned to another camera; more messages; the
+    alphabetical order. A doubt about a chosen stream causes a warning.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def _best(recording: Recording, streams: tuple[Stream, ...]) -> Stream:
         names = listed([f"{s.topic} ({s.kind})" for s in usable])
         msg = f"{recording.path}: several sensors: {names}; choose with --topic"
         raise NoStreamError(msg)
-    return min(sensors[0], key=_rank)
+    return min(sensors[0], key=lambda stream: _rank(stream, sensors[0]))
 
 
 def _select(
@@ -177,11 +177,12 @@ def _warnings(recording: Recording) -> str:
     return f"; warnings: {'; '.join(texts)}" if texts else ""
 
 
-def _rank(stream: Stream) -> tuple[bool, bool, bool, bool, int, str]:
+def _rank(stream: Stream, streams: Sequence[Stream]) -> tuple[bool | int | str, ...]:
+    rare = any(one.kind == stream.kind and one.count > 2 * stream.count for one in streams)
     aligned = any(word in stream.topic for word in ("aligned", "registered", "depth_to_"))
     unnamed = stream.kind == "depth" and "depth" not in _image_name(stream.topic)
     kind = stream.kind != "depth"
-    return (stream.doubt != "", kind, unnamed, aligned, -stream.count, stream.topic)
+    return (stream.doubt != "", kind, unnamed, rare, aligned, -stream.count, stream.topic)
 
 
 def _image_name(topic: str) -> str:
