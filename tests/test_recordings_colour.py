@@ -641,6 +641,21 @@ def test_colour_without_transform_is_unused(tmp_path: Path) -> None:
     assert any("no transform between camera and color_optical" in w for w in warnings)
 
 
+@pytest.mark.parametrize("frame_id", ["wrist", "camera", ""])
+def test_images_that_only_seem_registered_are_reported(tmp_path: Path, frame_id: str) -> None:
+    """All cameras of a simulation may have equal intrinsics: masks were on images of the wrist."""
+    colours = raw(EPOCH, gradient(), "rgb8", frame_id)
+    items = depth_items(EPOCH, frame_id=frame_id and "camera")
+    items += [("/w/camera_info", EPOCH, info(EPOCH)), ("/w/image_raw", EPOCH, colours)]
+    ((_, view),), warnings = read(write(tmp_path / "a.mcap", items))
+
+    assert view is not None
+    assert view.registered
+    guess = "its images count as registered, for their intrinsics"
+    doubted = f"/w/image_raw: no transform between camera and wrist; {guess}"
+    assert warnings == ([doubted] if frame_id == "wrist" else [])
+
+
 def test_extrinsics_topic_without_messages_is_ignored(tmp_path: Path) -> None:
     """A recording that starts after the driver lacks its messages, and must still be processed."""
     declared = [("/cam/extrinsics/depth_to_color", "std_msgs/msg/String")]

@@ -292,12 +292,15 @@ class _Partner:
         if pose is not None:
             offset = frame.frame_from_sensor
             return ColourView(image, lens, pose if offset is None else compose(pose, offset))
-        # Only registered images have the intrinsics of the depth camera.
-        if same_shape and are_equal(lens, frame.camera):
-            return ColourView(image, lens, None if aligned else IDENTITY)
         names = (name or "a frame without a name" for name in (frame.frame_id, image.frame_id))
-        msg = f"no transform between {' and '.join(names)}"
-        raise MessageError(msg)
+        problem = f"no transform between {' and '.join(names)}"
+        # Registered images have the intrinsics of the depth camera; so may simulated cameras.
+        if same_shape and are_equal(lens, frame.camera):
+            if not same_frame(frame.frame_id, image.frame_id):
+                guess = "its images count as registered, for their intrinsics"
+                self._recording.warn(f"{image.topic}: {problem}; {guess}")
+            return ColourView(image, lens, None if aligned else IDENTITY)
+        raise MessageError(problem)
 
     @cached_property
     def _first_lens(self) -> LensCamera | None:
