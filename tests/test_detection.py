@@ -969,3 +969,17 @@ def test_row_and_column_of_flat_index_are_exact(columns: int) -> None:
     for i in (0, 1, 7, 199, 1999):
         assert row_and_column(i * columns, columns) == (i, 0)
         assert row_and_column(i * columns + columns - 1, columns) == (i, columns - 1)
+
+
+def test_frames_hold_arrays_row_by_row() -> None:
+    """For a mirrored image, detection would compile its kernels again, for half a minute."""
+    depth = np.linspace(0.5, 2.5, 24, dtype=np.float32).reshape(4, 6)
+    mirrored = frame_of(depth[:, ::-1], Camera(6, 4, 525.0, 525.0, 2.5, 1.5)).depth
+    points = Frame("cloud", 0, 0, 0, "base", points=np.arange(15.0).reshape(3, 5).T).points
+
+    assert mirrored is not None
+    assert points is not None
+    assert mirrored.flags.c_contiguous
+    assert points.flags.c_contiguous
+    np.testing.assert_array_equal(mirrored, depth[:, ::-1])
+    np.testing.assert_array_equal(points, np.arange(15).reshape(3, 5).T)

@@ -63,6 +63,9 @@ class Frame(Record):
 
     def __post_init__(self) -> None:
         """Check that the frame has either points, or depth and a camera of the same size."""
+        for name in ("depth", "points"):  # kernels would be compiled again for strided arrays
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, np.asarray(value, np.float32, order="C"))
         super().__post_init__()
         if (self.depth is None) == (self.points is None):
             msg = "a Frame has either depth or points"
