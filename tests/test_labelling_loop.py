@@ -99,7 +99,7 @@ def test_new_category_is_learned_from_corrections(
     """Two labels are wrong and one category is new; known categories must not suffer.
 
     Views that were learned from are easy. On other tables, a model that fits badly or is too
-    careful misses glasses, or takes cups for glasses.
+    careful misses glasses, or takes most cups for glasses.
     """
     if not tables:  # a rough fit suffices for views that were learned from
         monkeypatch.setattr("shapecat.learning.incremental._STEPS", 30)
@@ -150,8 +150,8 @@ def test_new_category_is_learned_from_corrections(
         unseen = tmp_path / "second" / other.stem
         after, truth = categories(unseen), true_categories(other, unseen)
         predicted_glasses.update(truth[track] for track, name in after.items() if name == NEW)
-    assert predicted_glasses.keys() == ({NEW} if others else set())
-    assert predicted_glasses[NEW] >= 7 * len(others) / 3  # of 4 on each table
+    assert predicted_glasses[NEW] >= 3.5 * len(others)  # of 4 on each table
+    assert predicted_glasses.total() - predicted_glasses[NEW] <= 1  # of 7 on each table
 
 
 def test_dataset_without_new_category_is_refused(shapecat: Run, tmp_path: Path) -> None:
