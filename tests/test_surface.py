@@ -264,6 +264,21 @@ def test_simd_adaptation_moves_only_winner_and_its_neighbours() -> None:
     assert age == 47 - 40
 
 
+def test_third_nearest_neuron_is_not_linked_across_a_gap() -> None:
+    """Two neurons on the far wall of a cup would be joined to its near wall."""
+    left, right = [[0, 0, 0], [1, 0, 0]], [[20, 0, 0], [21, 0, 0], [20, 1, 0], [21, 1, 0]]
+    places = np.array([*left, *right], np.float32)
+    gas = empty_gas(len(places))
+    for axis in range(3):
+        gas[axis][: len(places)] = places[:, axis]
+    points = np.repeat(places, 2, axis=0)
+    adjacent = finish_graph(Cloud(*np.ascontiguousarray(points.T)), gas, len(places), 0.1)
+
+    assert adjacent[0, 1]
+    assert adjacent[2:, 2:].sum() >= 8
+    assert np.argwhere(adjacent[:2, 2:]).tolist() == [[1, 0]]  # the bridge between the parts
+
+
 def _fritzke(points: F4, state: int, target: int, signals: int, interval: int) -> NeuralGas:
     """Run Algorithm 3 of the thesis step by step, with the deviations that the kernel states.
 
