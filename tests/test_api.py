@@ -414,6 +414,27 @@ def test_merged_tracks_are_described_as_one(guessed_run: Path, tmp_path: Path) -
     assert repr(run).endswith(f": 8 frames, {count - 1} tracks>")
 
 
+def test_run_that_is_replaced_while_it_is_open_is_refused(
+    guessed_run: Path, tmp_path: Path
+) -> None:
+    """Its labels would go to tracks of the new run that happen to have the same numbers."""
+    folder = tmp_path / "run"
+    shutil.copytree(guessed_run, folder)
+    run = shapecat.open_run(folder)
+    begun, later = run.labelled_frames(), run.labelled_frames()
+    next(begun)
+    text = (folder / "run.json").read_text("utf-8")
+    (folder / "run.json").write_text(text.replace(run.info["work"], "w0123456789abcdef"), "utf-8")
+
+    for frames in (later, run.frames()):
+        with pytest.raises(OutputError, match="was processed again meanwhile"):
+            next(frames)
+    for table in (run.detections, run.tracks, run.frame_table, run.planes):
+        with pytest.raises(OutputError, match="was processed again meanwhile"):
+            table.arrow("frame")
+    assert len([*begun]) == 7  # the files are still open
+
+
 def test_frames_of_one_topic_are_read(page_folder: Path) -> None:
     """A single name is one topic, as for `process`, not a list of letters."""
     with shapecat.open_recording(page_folder / "demo.mcap") as recording:

@@ -20,6 +20,7 @@ from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.counts import plural
 from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.runs.finished import FinishedRun, open_source, read_finished
+from shapecat.runs.folder import require_work
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables.reading import first_stamp, numbers_or_nan, with_fixed_lists
 from shapecat.types import Frame, LabelledFrame, LabelledObject
@@ -32,11 +33,12 @@ class Table:
     """A table of a run; reads the requested columns on demand.
 
     ``widths`` holds, for columns of equally long lists, the length of these lists. It is needed
-    if the table has no rows.
+    if the table has no rows. ``work`` is the id of the run whose table may be read.
     """
 
     path: Path
     widths: Mapping[str, int] = field(default_factory=dict, compare=False, repr=False)
+    work: str = field(default="", compare=False, repr=False)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -54,7 +56,8 @@ class Table:
 
         Raises
         ------
-        OutputError : the table is unreadable, or has no such column.
+        OutputError : the table is unreadable or has no such column, or its run has been replaced
+            since it was opened.
         """
         available = self.columns
         wanted = available if columns is None else columns
@@ -66,7 +69,10 @@ class Table:
             self._reading(),
             pq.ParquetFile(self.path, page_checksum_verification=True) as file,
         ):
-            return with_fixed_lists(file.read(columns=names))
+            table = with_fixed_lists(file.read(columns=names))
+        if self.work:
+            require_work(self.path.parent, self.work)
+        return table
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
@@ -180,10 +186,11 @@ class Run:
             "descriptor": len(DESCRIPTOR_NAMES),
             "outline_full": DIRECTIONS,
         }
-        self.detections = Table(folder / "detections.parquet", widths)
-        self.tracks = Table(folder / "tracks.parquet", widths)
-        self.frame_table = Table(folder / "frames.parquet")
-        self.planes = Table(folder / "planes.parquet")
+        work = self.info["work"]
+        self.detections = Table(folder / "detections.parquet", widths, work)
+        self.tracks = Table(folder / "tracks.parquet", widths, work)
+        self.frame_table = Table(folder / "frames.parquet", work=work)
+        self.planes = Table(folder / "planes.parquet", work=work)
 
     def __repr__(self) -> str:
         frames, labels = self.info["counts"]["frames"], self._finished.labels.values()
@@ -232,7 +239,12 @@ class Run:
         return seconds, self.tracks.numpy("posterior")[rows]
 
     def labelled_frames(self) -> Iterator[LabelledFrame]:
-        """Yield the frames without their points; this does not need the recording."""
+        """Yield the frames without their points; this does not need the recording.
+
+        Raises
+        ------
+        OutputError : as for `frames`, apart from the recording.
+        """
         return self._finished.frames()
 
     def frames(self, recording: str | Path | None = None) -> Iterator[RunFrame]:
@@ -243,7 +255,8 @@ class Run:
         Raises
         ------
         RecordingError : the recording is missing or unreadable.
-        OutputError : its content has changed since it was processed.
+        OutputError : its content has changed since it was processed, a table is unreadable, or the
+            run has been replaced since it was opened.
         """
         moved = None
         if recording is not None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from shapecat.errors import OutputError, RecordingError, ShapecatError
 from shapecat.recordings import Recording, open_recording
-from shapecat.runs.folder import read_run
+from shapecat.runs.folder import read_run, require_work
 from shapecat.runs.identity import content_digest, same_content
 from shapecat.runs.labelled_frames import read_labelled_frames
 from shapecat.runs.labels.corrections import read_labelled_table
@@ -47,8 +47,14 @@ class FinishedRun:
         return (*of_model, *sorted(added))
 
     def frames(self) -> Iterator[LabelledFrame]:
-        """Read the labelled frames."""
-        return read_labelled_frames(self.folder, self.labels)
+        """Read the labelled frames.
+
+        Raises
+        ------
+        OutputError : a table is unreadable, or the run has been replaced since it was opened.
+        """
+        require_work(self.folder, self.info["work"])  # else labels go to tracks of another run
+        yield from read_labelled_frames(self.folder, self.labels)
 
     def frames_with_full_boxes(self) -> Iterator[LabelledFrame]:
         """Read the labelled frames; their boxes are full boxes where these are known.

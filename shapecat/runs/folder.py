@@ -83,7 +83,7 @@ def require_work(folder: Path, work: str) -> None:
     OutputError : the run has another id, or there is none.
     """
     if read_run(folder)["work"] != work:
-        msg = f"{folder}: was processed again since its report was made; make the report again"
+        msg = f"{folder}: was processed again meanwhile; open it, or make its report, again"
         raise OutputError(msg)
 
 
