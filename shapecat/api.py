@@ -5,7 +5,7 @@
 
 import difflib
 import os
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
@@ -114,7 +114,7 @@ def process(
     out: str | Path,
     *,
     topics: str | Iterable[str] = (),
-    up: str | Sequence[float] = "auto",
+    up: str | Iterable[float] = "auto",
     fixed_frame: str | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
@@ -157,8 +157,8 @@ def process(
     """
     _require_known(settings, process.__annotations__)
     frame_range = FrameRange(start_s, end_s, every)
-    if cores < 1:
-        msg = f"cores must be at least 1, got {cores}"
+    if cores < 1 or cores % 1:
+        msg = f"cores must be an integer of at least 1, got {cores}"
         raise ConfigError(msg)
     if discard_labels and not overwrite:
         msg = "discard_labels needs overwrite: without it, labels stay with their results"
@@ -182,7 +182,7 @@ def process(
         overwrite=overwrite,
         discard_labels=discard_labels,
     )
-    pipeline.process(job, observe or ignore, cores=cores)
+    pipeline.process(job, observe or ignore, cores=int(cores))
     return Run(job.folder)
 
 
@@ -190,7 +190,7 @@ def perceive(
     reading: ArrayLike | Frame,
     intrinsics: ArrayLike | Camera | None = None,
     *,
-    up: Sequence[float] | None = None,
+    up: ArrayLike | None = None,
     model: str | Path | None = None,
     config: str | Path | None = None,
     **settings: Any,

@@ -2,6 +2,7 @@
 
 import io
 import json
+import pydoc
 import re
 import runpy
 import shutil
@@ -262,7 +263,7 @@ def test_points_of_the_caller_are_not_changed() -> None:
 
 def test_perceiving_points_finds_same_objects_as_depth_image(image: Any) -> None:
     """Invalid rows stay in place, so that masks fit the caller's points."""
-    from_points = shapecat.perceive(image.xyz(), up=(0, -6.2, -7.8))
+    from_points = shapecat.perceive(image.xyz(), up=np.array([0, -6.2, -7.8]))
     from_depth = shapecat.perceive(image.depth, intrinsics(image.camera))
 
     assert from_points.labels.shape == (image.camera.width * image.camera.height,)
@@ -305,6 +306,14 @@ class OnGpu:
         raise TypeError(msg)
 
 
+class WithGradient:
+    """A tensor as a depth network returns it."""
+
+    def __array__(self, *_: Any, **__: Any) -> Any:
+        msg = "Can't call numpy() on Tensor that requires grad. Use tensor.detach().numpy()"
+        raise RuntimeError(msg)
+
+
 @pytest.mark.parametrize(
     ("reading", "options", "problem"),
     [
@@ -345,6 +354,8 @@ class OnGpu:
             "a frame has its own intrinsics",
         ),
         (OnGpu(), {}, r"not an array of numbers: .*cpu\(\)"),
+        (WithGradient(), {}, r"not an array of numbers: .*detach\(\)"),
+        (IMAGE, {"intrinsics": WithGradient()}, "fx, fy, cx, cy in pixels of an image of 6 x 4"),
         (np.array([["a"]]), {"intrinsics": (5, 5, 3, 2)}, "depth image"),
         (np.ones((9, 3)), {"up": (0, 0, 0)}, "up: expected a direction"),
         (np.ones((9, 3)), {"up": (0, 1)}, "up: expected a direction"),
@@ -638,8 +649,11 @@ def test_wrong_settings_and_folders_are_refused(page_folder: Path, tmp_path: Pat
         shapecat.process(page_folder / "demo.mcap", tmp_path, topic="/camera/depth/image_raw")
     with pytest.raises(ConfigError, match="discard_labels needs overwrite"):
         shapecat.process(page_folder / "demo.mcap", tmp_path, discard_labels=True)
-    with pytest.raises(ConfigError, match="cores must be at least 1, got 0"):
-        shapecat.process(page_folder / "demo.mcap", tmp_path, cores=0)
+    for cores in (0, 1.5):  # half of an odd number of processors
+        with pytest.raises(
+            ConfigError, match=f"cores must be an integer of at least 1, got {cores}"
+        ):
+            shapecat.process(page_folder / "demo.mcap", tmp_path, cores=cores)  # type: ignore[arg-type]
     with pytest.raises(AttributeError, match="nothing"):
         _ = shapecat.nothing
 
@@ -720,13 +734,13 @@ def test_run_of_the_current_folder_has_its_name(
 def test_process_accepts_single_topic_and_up_vector(page_folder: Path, tmp_path: Path) -> None:
     """A single topic was read as a list of letters, and an up vector ended in a traceback."""
     plain: Any = {"every": 8, "mcap": False, "rrd": False}
-    topic, up = "/camera/depth/image_raw", (0, -0.75, -0.5)
+    topic, up = "/camera/depth/image_raw", np.array([0, -0.75, -0.5])
 
     run = shapecat.process(page_folder / "demo.mcap", tmp_path, topics=topic, up=up, **plain)
 
     assert (run.info["options"]["topics"], run.info["options"]["up"]) == ([topic], "0.0,-0.75,-0.5")
     given = np.array(run.frame_table.numpy("up_given")[0])
-    np.testing.assert_allclose(given, np.array(up) / np.linalg.norm(up), atol=1e-6)
+    np.testing.assert_allclose(given, up / np.linalg.norm(up), atol=1e-6)
 
 
 def test_folder_of_recordings_is_refused(page_folder: Path, tmp_path: Path) -> None:
@@ -756,6 +770,13 @@ def test_url_is_refused(page_folder: Path, tmp_path: Path, monkeypatch: pytest.M
 def test_import_does_not_load_numpy() -> None:
     """Every command imports the package, so a heavy import would delay `--help`."""
     assert loaded_by("import shapecat", {"numpy"}) == set()
+
+
+def test_names_that_load_on_first_use_are_listed() -> None:
+    """Notebooks complete names from `dir`; `help` shows the functions only if they are in it."""
+    assert {*shapecat.__all__, "__version__"} <= {*dir(shapecat)}
+    for name in ("open_run", "perceive", "process"):
+        assert f"{name}(" in pydoc.plain(pydoc.render_doc(shapecat))
 
 
 def test_several_cores_require_main_guard_in_script(tmp_path: Path) -> None:

@@ -45,7 +45,8 @@ def frame_of(reading: ArrayLike | Frame, intrinsics: ArrayLike | Camera | None =
         return reading
     try:
         values = np.asarray(reading)
-    except (TypeError, ValueError) as error:  # rows of different lengths, or a tensor on a GPU
+    except (TypeError, ValueError, RuntimeError) as error:
+        # rows of different lengths, or a tensor on a GPU or with a gradient
         msg = f"not an array of numbers: {error}"
         raise ConfigError(msg) from error
     masked = np.ma.getmaskarray(reading if isinstance(reading, np.ma.MaskedArray) else values)
@@ -100,7 +101,7 @@ def _camera(intrinsics: ArrayLike | Camera, height: int, width: int) -> Camera:
     """Return the camera of an image; raise `ConfigError` if the intrinsics are implausible."""
     if isinstance(intrinsics, Camera) and (intrinsics.width, intrinsics.height) == (width, height):
         return intrinsics
-    with suppress(TypeError, ValueError):  # not numbers, or rows of different lengths
+    with suppress(TypeError, ValueError, RuntimeError):  # not numbers, or rows of different lengths
         values = np.asarray(intrinsics, np.float64)
         if values.shape == (3, 3) and (values[_FIXED] == np.eye(3)[_FIXED]).all():
             values = values[[0, 1, 0, 1], [0, 1, 2, 2]]
@@ -117,7 +118,7 @@ def _camera(intrinsics: ArrayLike | Camera, height: int, width: int) -> Camera:
 
 
 def perceive_alone(
-    frame: Frame, *, up: Sequence[float] | None, categorizer: Categorizer, settings: Settings
+    frame: Frame, *, up: ArrayLike | None, categorizer: Categorizer, settings: Settings
 ) -> RunFrame:
     """Perceive one frame, and return its objects with labels from this view alone.
 
