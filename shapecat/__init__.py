@@ -21,3 +21,8 @@ def __getattr__(name: str) -> Any:
         return getattr(import_module("shapecat.api"), name)
     msg = f"module 'shapecat' has no attribute {name!r}"
     raise AttributeError(msg)
+
+
+def __dir__() -> list[str]:
+    """List the names of `shapecat.api` for completion and ``help``, even before they are loaded."""
+    return sorted({*globals(), *__all__})
