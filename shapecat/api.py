@@ -138,8 +138,16 @@ def process(
 
     Parameters
     ----------
-    topics, up, fixed_frame, start_s, end_s, every, model, config, overwrite, discard_labels : as
-        the options of the command. ``topics`` is one topic or several; ``up`` may be three numbers.
+    topics : one topic of depth images or clouds, or several; needed if there are several cameras.
+    up : up direction: ``tf`` from transforms, ``imu`` from an accelerometer, or three numbers in
+        the sensor frame; ``auto`` uses transforms, else an accelerometer, else the planes.
+    fixed_frame : frame in which objects stand still, such as ``map``; None to choose one.
+    start_s, end_s : limits, seconds after the start of the recording; None for no limit.
+    every : process every n-th frame.
+    model : path of a model file; None for the model that comes with shapecat.
+    config : path of a TOML file with settings.
+    overwrite : whether to replace other results; corrected labels are transferred.
+    discard_labels : with ``overwrite``, whether to drop corrected labels.
     color : topic of the colour images; None to choose one, empty to use none.
     mcap, rrd : whether to write annotated.mcap and review.rrd.
     cores : number of processes that perceive frames. If there are several, a script must have
