@@ -357,6 +357,8 @@ class WithGradient:
         (WithGradient(), {}, r"not an array of numbers: .*detach\(\)"),
         (IMAGE, {"intrinsics": WithGradient()}, "fx, fy, cx, cy in pixels of an image of 6 x 4"),
         (np.array([["a"]]), {"intrinsics": (5, 5, 3, 2)}, "depth image"),
+        # Of a data frame that may hold nulls: its shape alone would be as expected.
+        (np.ones((9, 3), object), {}, r"got object \(9, 3\)"),
         (np.ones((9, 3)), {"up": (0, 0, 0)}, "up: expected a direction"),
         (np.ones((9, 3)), {"up": (0, 1)}, "up: expected a direction"),
         (np.ones((9, 3)), {"up": (0, np.inf, 1)}, "up: expected a direction"),

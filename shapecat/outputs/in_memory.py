@@ -65,7 +65,8 @@ def _points(values: np.ndarray, masked: Bool) -> F4:
     ConfigError : the shape or the type is wrong, or the unit is not metres.
     """
     if values.dtype.kind not in "fiu" or values.ndim not in {2, 3} or values.shape[-1] != 3:
-        msg = f"expected points (n, 3), or a depth image with intrinsics, got {values.shape}"
+        found = f"{values.dtype} {values.shape}"
+        msg = f"expected points (n, 3), or a depth image with intrinsics, got {found}"
         raise ConfigError(msg)
     points = values.reshape(-1, 3).astype(np.float32, order="C")
     finite = np.isfinite(points).all(axis=1) & ~masked.reshape(-1, 3).any(axis=1)
