@@ -6,8 +6,10 @@
 import difflib
 import os
 from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import Any, Self
 
 from numpy.typing import ArrayLike
@@ -53,10 +55,14 @@ def open_run(folder: str | Path) -> Run:
 
 
 class OpenRecording:
-    """An open recording, from which frames are read; a context manager that closes it."""
+    """An open recording, from which frames are read; a context manager that closes it.
+
+    Threads may share it; each process has to open the recording itself.
+    """
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
+        self._process, self._reading = os.getpid(), Lock()
 
     def __enter__(self) -> Self:
         return self
@@ -90,12 +96,35 @@ class OpenRecording:
         ------
         ConfigError : ``start_s``, ``end_s`` or ``every`` is invalid.
         NoStreamError : a topic is missing or not usable, or none is given and none can be chosen.
-        RecordingError : the recording is closed, perhaps while its frames are read.
+        RecordingError : the recording is closed, perhaps while its frames are read, or was opened
+            by a process from which this one was forked.
         """
         frame_range = FrameRange(start_s, end_s, every)
         chosen = (topics,) if isinstance(topics, str) else tuple(topics)
-        streams = choose_streams(self.recording, chosen)
-        return frames(self.recording, streams, frame_range)
+        with self._alone():
+            streams = choose_streams(self.recording, chosen)
+        return self._one_by_one(frames(self.recording, streams, frame_range))
+
+    def _one_by_one(self, read: Iterator[Frame]) -> Iterator[Frame]:
+        while True:
+            with self._alone():
+                frame = next(read, None)
+            if frame is None:
+                return
+            yield frame
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Let one thread read at a time; refuse other processes.
+
+        All threads, and processes forked from this one, share the position in the file. Messages
+        read elsewhere in the file would count as damaged, and be skipped.
+        """
+        if os.getpid() != self._process:
+            msg = f"{self.recording.path}: is open in another process; open it in each process"
+            raise RecordingError(msg)
+        with self._reading:
+            yield
 
 
 def open_recording(path: str | Path) -> OpenRecording:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import pydoc
 import re
 import runpy
@@ -9,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -470,6 +472,33 @@ def test_frames_of_closed_recording_are_refused(tmp_path: Path, container: str, 
         next(frames)
     with pytest.raises(RecordingError, match=r"closed; read its frames before"):
         recording.frames()
+
+
+@pytest.mark.parametrize("container", ["mcap", "ros1"])
+def test_threads_that_share_a_recording_read_all_of_its_frames(
+    tmp_path: Path, container: str
+) -> None:
+    """A file has one position: messages between those of another thread seemed to be damaged."""
+    path = record(tmp_path / "a", 9, container=container)
+    with shapecat.open_recording(path) as recording, ThreadPoolExecutor(4) as pool:
+        jobs = [pool.submit(lambda: [f.stamp_ns for f in recording.frames()]) for _ in range(40)]
+        read = [job.result() for job in jobs]
+
+    assert len(read[0]) == 9
+    assert read == read[:1] * 40
+
+
+def test_recording_that_was_opened_before_a_fork_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Forked processes share the position in the file, and skipped frames like threads."""
+    with shapecat.open_recording(record(tmp_path / "a", 3)) as recording:
+        begun = recording.frames()
+        next(begun)
+        monkeypatch.setattr(os, "getpid", lambda: 1)
+        for read in (lambda: next(begun), recording.frames):
+            with pytest.raises(RecordingError, match="open it in each process"):
+                read()
 
 
 def test_topic_of_several_publishers_is_listed_once(tmp_path: Path) -> None:
