@@ -253,6 +253,16 @@ def test_masked_values_are_missing(image: Any) -> None:
     assert np.isfinite(np.delete(points.points, 6, axis=0)).all()
 
 
+def test_largest_number_is_missing() -> None:
+    """Some drivers write it where there is no depth; NumPy warned of an overflow, an error here."""
+    largest = np.finfo(np.float64).max
+    depth = shapecat.perceive(np.diag([0.7, largest, 0.9]), (5, 6, 1, 1))
+    points = shapecat.perceive([[0.1, 0.2, 0.7], [0.3, largest, 0.9]])
+
+    np.testing.assert_array_equal(depth.reading.depth, np.diag([0.7, 0, 0.9]).astype(np.float32))
+    np.testing.assert_array_equal(np.isnan(points.points).all(axis=1), [False, True])
+
+
 def test_points_of_the_caller_are_not_changed() -> None:
     """Incomplete rows become NaN in a copy, as the caller may use the points again."""
     points = np.ones((5, 3), np.float32)

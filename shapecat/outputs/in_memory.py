@@ -68,7 +68,8 @@ def _points(values: np.ndarray, masked: Bool) -> F4:
         found = f"{values.dtype} {values.shape}"
         msg = f"expected points (n, 3), or a depth image with intrinsics, got {found}"
         raise ConfigError(msg)
-    points = values.reshape(-1, 3).astype(np.float32, order="C")
+    with np.errstate(over="ignore"):  # the largest float64 may mean "missing"
+        points = values.reshape(-1, 3).astype(np.float32, order="C")
     finite = np.isfinite(points).all(axis=1) & ~masked.reshape(-1, 3).any(axis=1)
     points[~finite] = np.nan
     sample = points[finite][:: 1 + len(points) // 10_000]  # enough for their median
@@ -90,7 +91,8 @@ def _depth(values: np.ndarray, masked: Bool) -> F4:
     if values.dtype.kind not in "fiu" or values.ndim != 2:
         msg = f"expected a depth image (h, w) of numbers, got {values.dtype} {values.shape}"
         raise ConfigError(msg)
-    depth = values.astype(np.float32, order="C") * (1.0 if values.dtype.kind == "f" else 0.001)
+    with np.errstate(over="ignore"):  # the largest float64 may mean "missing"
+        depth = values.astype(np.float32, order="C") * (1.0 if values.dtype.kind == "f" else 0.001)
     depth[masked | ~(np.isfinite(depth) & (depth > 0))] = 0
     if depth.any() and np.median(depth[depth > 0]) > _FARTHEST_M:
         msg = "expected depth in metres; divide millimetres by 1000, or pass integers"
