@@ -8,9 +8,9 @@ from numpy.random import Generator
 
 from shapecat.arrays import F8
 from shapecat.simulation.scenes.worlds import Support
-from shapecat.simulation.shapes.mesh import Mesh, moved
+from shapecat.simulation.shapes.mesh import Mesh
+from shapecat.simulation.shapes.parts import placed
 from shapecat.simulation.shapes.primitives import extrude, rounded_box
-from shapecat.types import Pose
 
 __all__ = [
     "as_equipment",
@@ -37,7 +37,7 @@ def make_room(rng: Generator, *, wall_chance: float) -> list[Support]:
     floor = _slab("floor", FLOOR, (8.0, 8.0, 0.05), (0, 0, 0))
     if rng.random() >= wall_chance:
         return [floor]
-    return [floor, _upright("wall", WALL, (8.0, 0.1, 2.6), (0, rng.uniform(0.8, 1.6)))]
+    return [floor, make_wall("wall", (8.0, 0.1, 2.6), (0, rng.uniform(0.8, 1.6)))]
 
 
 def make_counter(rng: Generator) -> Support:
@@ -65,7 +65,7 @@ def round_table(radius: float, height: float, thick: float) -> Support:
     """Return a disc on the world's z axis, ``thick`` metres thick, its upper face at ``height``."""
     t = np.arange(48) * (2 * np.pi / 48)
     ring = np.stack([radius * np.cos(t), radius * np.sin(t)], -1)
-    mesh = moved(extrude(ring, thick), Pose(np.eye(3), np.array([0, 0, height - thick])))
+    mesh = placed(extrude(ring, thick), (0, 0, height - thick))
     return Support("table", TABLE, mesh, np.column_stack([ring, np.full(48, height)]))
 
 
@@ -77,18 +77,11 @@ def make_shelf(
     The lowest board is at z = ``low``; the spacing of the boards is ``step``.
     """
     thick = 0.02
-    top = low + 3 * step
     boards = [
         _slab(f"board_{k + 1}", BOARD + k, (width, depth, thick), (0, 0, low + k * step))
         for k in range(3)
     ]
-    beside, behind = (width + thick) / 2, (depth + thick) / 2
-    sides = [
-        _upright("left_side", SIDE, (thick, depth, top), (-beside, 0)),
-        _upright("right_side", SIDE, (thick, depth, top), (beside, 0)),
-        _upright("back", BACK, (width + 2 * thick, thick, top), (0, behind)),
-    ]
-    return boards, sides
+    return boards, _sides(width, depth, low + 3 * step, thick)
 
 
 def make_rack(rng: Generator, supports: Sequence[Support]) -> list[Support]:
@@ -101,7 +94,7 @@ def make_rack(rng: Generator, supports: Sequence[Support]) -> list[Support]:
     place = np.abs(points[:, :2]).max(axis=0) + rng.uniform(-0.7, 0.5) * wide
     tall = float(points[:, 2].max()) + rng.uniform(0.02, 0.4)
     posts = [
-        _upright(f"post_{k}", EQUIPMENT, (*wide, tall), place * (x, y))
+        _board(f"post_{k}", EQUIPMENT, (*wide, tall), (*place * (x, y), 0))
         for k, (x, y) in enumerate([(-1, -1), (-1, 1), (1, -1), (1, 1)])
     ]
     gone = {"left_side", "right_side", "back" if rng.random() < 2 / 3 else ""}
@@ -113,13 +106,9 @@ def make_bin(rng: Generator) -> tuple[Support, list[Support]]:
     width, depth, tall = rng.uniform(0.3, 0.6), rng.uniform(0.25, 0.45), rng.uniform(0.1, 0.3)
     height, thick = rng.choice([0.01, rng.uniform(0.4, 0.9)]), rng.uniform(0.003, 0.012)
     bottom = _slab("bin", TABLE, (width, depth, 0.01), (0, 0, height))
-    beside, before = (width + thick) / 2, (depth + thick) / 2
-    return bottom, [
-        _board("left_side", SIDE, (thick, depth, tall), (-beside, 0, height)),
-        _board("right_side", SIDE, (thick, depth, tall), (beside, 0, height)),
-        _board("front", BACK, (width + 2 * thick, thick, tall), (0, -before, height)),
-        _board("back", BACK, (width + 2 * thick, thick, tall), (0, before, height)),
-    ]
+    left, right, back = _sides(width, depth, tall, thick, height)
+    size, place = (width + 2 * thick, thick, tall), (0, -(depth + thick) / 2, height)
+    return bottom, [left, right, _board("front", BACK, size, place), back]
 
 
 def make_tote(rng: Generator, supports: Sequence[Support]) -> list[Support]:
@@ -161,12 +150,7 @@ def make_compartment(rng: Generator) -> tuple[Support, list[Support], Support]:
     width, depth, tall = rng.uniform(0.3, 0.5), rng.uniform(0.25, 0.4), rng.uniform(0.22, 0.35)
     height, thick = rng.uniform(0.3, 1.2), 0.012
     board = _slab("board_1", BOARD, (width, depth, thick), (0, 0, height))
-    beside, behind = (width + thick) / 2, (depth + thick) / 2
-    walls = [
-        _board("left_side", SIDE, (thick, depth, tall), (-beside, 0, height)),
-        _board("right_side", SIDE, (thick, depth, tall), (beside, 0, height)),
-        _board("back", BACK, (width + 2 * thick, thick, tall), (0, behind, height)),
-    ]
+    walls = _sides(width, depth, tall, thick, height)
     top = _board("top", WALL, (width + 2 * thick, depth, thick), (0, 0, height + tall))
     return board, walls, top
 
@@ -174,7 +158,7 @@ def make_compartment(rng: Generator) -> tuple[Support, list[Support], Support]:
 def _slab(name: str, label: int, size: Sequence[float], top_middle: Sequence[float]) -> Support:
     """Return a horizontal board of ``size`` (3,); its upper face is centred at ``top_middle``."""
     x, y, z = top_middle
-    mesh = moved(rounded_box(size, fine=1), Pose(np.eye(3), np.array([x, y, z - size[2]])))
+    mesh = placed(rounded_box(size, fine=1), (x, y, z - size[2]))
     a, b = size[0] / 2, size[1] / 2
     corners = [[x - a, y - b, z], [x + a, y - b, z], [x + a, y + b, z], [x - a, y + b, z]]
     return Support(name, label, mesh, np.array(corners))
@@ -182,18 +166,27 @@ def _slab(name: str, label: int, size: Sequence[float], top_middle: Sequence[flo
 
 def make_wall(name: str, size: Sequence[float], place: Sequence[float]) -> Support:
     """Return a wall or cupboard of size (3,) on the floor, centred at ``place`` (2,)."""
-    return _upright(name, WALL, size, place)
+    return _board(name, WALL, size, (*place, 0))
 
 
-def _upright(name: str, label: int, size: Sequence[float], place: Sequence[float]) -> Support:
-    """Return an upright board of ``size`` (3,) on the floor, centred at ``place`` (2,)."""
-    return _board(name, label, size, (*place, 0.0))
+def _sides(
+    width: float, depth: float, tall: float, thick: float, height: float = 0.0
+) -> list[Support]:
+    """Return the left side, the right side and the back around an area ``width`` by ``depth``.
+
+    They are ``tall`` metres tall and ``thick`` metres thick; their lower edge is at ``height``.
+    """
+    beside, behind = (width + thick) / 2, (depth + thick) / 2
+    return [
+        _board("left_side", SIDE, (thick, depth, tall), (-beside, 0, height)),
+        _board("right_side", SIDE, (thick, depth, tall), (beside, 0, height)),
+        _board("back", BACK, (width + 2 * thick, thick, tall), (0, behind, height)),
+    ]
 
 
 def _board(name: str, label: int, size: Sequence[float], place: Sequence[float]) -> Support:
     """Return a board that holds no objects; ``place`` (3,) is the centre of its lower face."""
-    shift = Pose(np.eye(3), np.array(place, np.float64))
-    return Support(name, label, moved(rounded_box(size, fine=1), shift))
+    return Support(name, label, placed(rounded_box(size, fine=1), place))
 
 
 def as_equipment(name: str, meshes: Sequence[Mesh]) -> list[Support]:
