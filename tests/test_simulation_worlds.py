@@ -188,7 +188,9 @@ def test_tabletop_of_more_categories_than_objects_draws_some_of_them() -> None:
 
 def test_boxes_turned_over_are_upside_down_in_layouts_as_in_piles() -> None:
     """The truth of a pile called such a box upside down, that of a layout did not."""
-    piece = layout.make_piece("box", np.random.default_rng(0), resting_pose="upside_down")
+    box = make_object("box", np.random.default_rng(0))
+    turned = next(stable for stable in stable_poses(box) if stable.name == "upside_down")
+    piece = layout.Piece("box", "box", box, turned)
     table = make_table(np.random.default_rng(0))
     placed = layout.place_piece(piece, 0, piece.stable_pose.pose, table, None)
 

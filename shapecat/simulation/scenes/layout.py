@@ -1,11 +1,11 @@
 """Place objects on supports and on each other without collisions."""
 
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 from numpy.random import Generator
 
-from shapecat.arrays import F8
+from shapecat.arrays import F8, Record
 from shapecat.geometry import IDENTITY, compose
 from shapecat.simulation.scenes.footprints import Footprint, footprint, inside, overlap
 from shapecat.simulation.scenes.worlds import PlacedObject, Support, pose_from_yaw
@@ -31,7 +31,7 @@ _EDGE_M = 0.01
 """Minimum distance of the contact area from the edge of the support."""
 
 
-class Piece(NamedTuple):
+class Piece(Record):
     """An object to be placed, with its stable pose."""
 
     category: str
@@ -39,21 +39,23 @@ class Piece(NamedTuple):
     mesh: Mesh
     stable_pose: StablePose
 
+    @cached_property
+    def footprint(self) -> Footprint:
+        """Its footprint in its stable pose."""
+        return footprint(self.mesh, self.stable_pose.pose)
 
-def make_piece(category: str, rng: Generator, *, resting_pose: str | None = None) -> Piece:
-    """Make a random object and choose its resting pose.
 
-    Parameters
-    ----------
-    category : one of the shape categories, or ``unknown`` for a distractor, which stays upright.
-    resting_pose : ``upright``, ``lying`` or ``upside_down``; random by default. An object without
-        such a stable pose stands upright.
+def make_piece(category: str, rng: Generator) -> Piece:
+    """Make a random object with a random resting pose.
+
+    ``category`` is one of the shape categories, or ``unknown`` for a distractor, which stays
+    upright.
     """
     if category == UNKNOWN:
         kind, mesh = make_distractor(rng)
     else:
         kind, mesh = category, make_object(category, rng)
-    pose_name = resting_pose or _draw_resting_pose(category, rng)
+    pose_name = _draw_resting_pose(category, rng)
     stable_pose = StablePose(IDENTITY, "upright")
     if pose_name != "upright" and category not in {"ball", UNKNOWN}:
         stable_pose = choose_stable_pose(stable_poses(mesh), pose_name, rng) or stable_pose
@@ -128,7 +130,7 @@ class Layout:
         """
         for _ in range(attempts):
             piece = make_piece(category, self._rng)
-            size = footprint(piece.mesh, piece.stable_pose.pose)
+            size = piece.footprint
             if size.high > self._headroom or np.ptp(size.outline, axis=0).max() > _WIDEST_M:
                 continue
             if self._rng.random() < stack and self._put_on_object(piece):
@@ -137,17 +139,16 @@ class Layout:
                 return True
         return False
 
-    def put_piece(self, piece: Piece, support: Support, half: F8, *, tries: int = 40) -> bool:
-        """Place a given object on a support; return whether there was room for it.
+    def put_piece(self, piece: Piece, support: Support, half: F8) -> bool:
+        """Try 40 random positions of an object on a support; return whether it was placed.
 
-        ``half`` (2,) is as for `put`; ``tries`` is the number of random positions to try.
+        ``half`` (2,) is as for `put`.
         """
         middle = support.outline[:, :2].mean(axis=0)
-        resting = footprint(piece.mesh, piece.stable_pose.pose)
-        for _ in range(tries):
+        for _ in range(40):
             spot = middle + self._rng.uniform(-half, half)
             turn = self._random_yaw_pose(np.array([*spot, support.height]))
-            placed = resting.moved(turn)
+            placed = piece.footprint.moved(turn)
             if self._fits(placed, support):
                 self._add(piece, turn, placed, support, None)
                 return True
@@ -177,14 +178,13 @@ class Layout:
         candidates = [k for k in range(len(self.objects)) if self._can_support(k)]
         if not candidates or piece.category == "ball":
             return False
-        resting = footprint(piece.mesh, piece.stable_pose.pose)
         for _ in range(8):
             k = candidates[int(self._rng.integers(len(candidates)))]
             below = self._places[k]
             slack = 0.25 * np.ptp(below.top, axis=0)
             spot = [*below.top.mean(axis=0) + self._rng.uniform(-slack, slack), below.high]
             turn = self._random_yaw_pose(np.array(spot))
-            placed = resting.moved(turn)
+            placed = piece.footprint.moved(turn)
             if _supports(below, placed) and self._fits(placed, self._base_supports[k]):
                 self._add(piece, turn, placed, self._base_supports[k], self.objects[k].track)
                 return True

@@ -8,7 +8,7 @@ from numpy.random import Generator
 
 from shapecat.arrays import F8
 from shapecat.geometry import compose
-from shapecat.simulation.scenes.footprints import Footprint, footprint, inside, overlap
+from shapecat.simulation.scenes.footprints import inside, overlap
 from shapecat.simulation.scenes.furniture import make_bin, make_room, make_shelf, make_table
 from shapecat.simulation.scenes.layout import SUPPORTING, Piece, make_piece, place_piece
 from shapecat.simulation.scenes.paths import Filming, arc_orbit
@@ -45,7 +45,6 @@ class _Place(NamedTuple):
     """
 
     piece: Piece
-    size: Footprint
     corner: F8
     below: int | None
 
@@ -108,7 +107,7 @@ class _Groups:
             group = _draw_group(category, rng, gap, np.array([*(1.6 * half), headroom_m]))
             if not group:
                 continue
-            length, depth, _ = np.max([p.corner + _extent(p.size) for p in group], axis=0)
+            length, depth, _ = np.max([p.corner + _extent(p.piece) for p in group], axis=0)
             corner = -np.array([length, depth, 0]) / 2
             outline = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * corner[:2]
             spot = middle + rng.uniform(-half, half)
@@ -143,7 +142,8 @@ class _Groups:
         for k, place in enumerate(group):
             if k not in carrying and rng.random() < missing:
                 continue
-            low = np.array([*place.size.outline.min(axis=0), place.size.low])
+            size = place.piece.footprint
+            low = np.array([*size.outline.min(axis=0), size.low])
             shift = np.array([*rng.uniform(-shift_m, shift_m, 2), 0])
             moved = Pose(np.eye(3), np.round(corner + place.corner - low + shift, 6))
             pose = compose(turn, compose(moved, place.piece.stable_pose.pose))
@@ -158,19 +158,19 @@ def _draw_group(category: str, rng: Generator, gap: float, room: F8) -> list[_Pl
     ``gap`` is the distance between objects, ``room`` (3,) the maximum size of the group, metres.
     """
     piece = make_piece(category, rng)
-    size = footprint(piece.mesh, piece.stable_pose.pose)
     between = np.array([gap, gap, 0])
-    step = _extent(size) + between
+    step = _extent(piece) + between
     most = np.minimum((room + between) / step, _MOST_ALONG).astype(int)
     if most.min() < 1:
         return []
     columns, lines, layers = rng.integers(1, most + 1, (2, 3)).max(axis=0).tolist()
     if rng.random() < _DIFFERENT:
         return _draw_row(category, rng, gap, columns, room[2])
-    if category not in SUPPORTING or len(size.top) < 3 or np.ptp(size.top, axis=0).min() < _TOP_M:
+    top = piece.footprint.top
+    if category not in SUPPORTING or len(top) < 3 or np.ptp(top, axis=0).min() < _TOP_M:
         layers = 1
     return [
-        _Place(piece, size, step * [x, y, z], k - lines * columns if z else None)
+        _Place(piece, step * [x, y, z], k - lines * columns if z else None)
         for k, (z, y, x) in enumerate(np.ndindex(layers, lines, columns))
     ]
 
@@ -186,13 +186,14 @@ def _draw_row(
     row, along = [], 0.0
     for _ in range(count):
         piece = make_piece(category, rng)
-        size = footprint(piece.mesh, piece.stable_pose.pose)
-        if size.high - size.low <= headroom_m:
-            row.append(_Place(piece, size, np.array([along, 0, 0]), None))
-            along += _extent(size)[0] + gap
+        length, _, height = _extent(piece)
+        if height <= headroom_m:
+            row.append(_Place(piece, np.array([along, 0, 0]), None))
+            along += length + gap
     return row
 
 
-def _extent(size: Footprint) -> F8:
-    """Return the size (3,) of the bounding box, metres."""
+def _extent(piece: Piece) -> F8:
+    """Return the size (3,) of the bounding box of a piece, metres."""
+    size = piece.footprint
     return np.array([*np.ptp(size.outline, axis=0), size.high - size.low])
