@@ -33,7 +33,7 @@ def table_with_glasses(seed: int) -> World:
     table = make_table(rng)
     layout = Layout(rng, gap=0.03)
     upright = StablePose(Pose(np.eye(3), np.zeros(3)), "upright")
-    pieces = [Piece(NEW, *make_distractor(rng, "wine_glass"), upright) for _ in range(4)]
+    pieces = [Piece(NEW, *make_distractor(rng, ["wine_glass"]), upright) for _ in range(4)]
     pieces += [Piece(name, name, make_object(name, rng), upright) for name in CATEGORIES]
     for piece in pieces:
         any(layout.put_piece(piece, table, np.array([0.36, 0.26])) for _ in range(10))

@@ -167,9 +167,10 @@ def test_training_uses_only_given_kinds_of_distractors(
     """The kinds of the test set must be new to the model in every scene."""
     made: list[str] = []
 
-    def make(rng: np.random.Generator, kind: str) -> tuple[str, Mesh]:
+    def make(rng: np.random.Generator, kinds: tuple[str, ...]) -> tuple[str, Mesh]:
+        kind, mesh = make_distractor(rng, kinds)
         made.append(kind)
-        return make_distractor(rng, kind)
+        return kind, mesh
 
     only = arrangements._SETTLED[number][0]
     monkeypatch.setattr(arrangements, "_SETTLED", ((only, 1.0, Arrangement([], ())),))

@@ -44,7 +44,7 @@ def test_fragment_is_counted_even_if_another_object_is_missed() -> None:
 @pytest.mark.parametrize("kind", PROCEDURAL)
 def test_procedural_families_give_distinct_objects_of_table_size(kind: str) -> None:
     """These objects train *unknown*, so they must fit on a table, and no two may be equal."""
-    found = [make_distractor(np.random.default_rng(seed), kind)[1] for seed in range(30)]
+    found = [make_distractor(np.random.default_rng(seed), [kind])[1] for seed in range(30)]
     for mesh in found:
         assert 0.02 < mesh.extents.max() < 0.6
         assert abs(mesh.vertices[:, 2].min()) < 1e-6

@@ -109,12 +109,12 @@ def test_unknown_category_raises() -> None:
     with pytest.raises(ValueError, match="spoon"):
         make_object("spoon", np.random.default_rng(0))
     with pytest.raises(ValueError, match="spoon"):
-        make_distractor(np.random.default_rng(0), "spoon")
+        make_distractor(np.random.default_rng(0), ["spoon"])
 
 
 @pytest.mark.parametrize("kind", DISTRACTORS)
 def test_every_distractor_is_generated(kind: str) -> None:
-    name, mesh = make_distractor(np.random.default_rng(1), kind)
+    name, mesh = make_distractor(np.random.default_rng(1), [kind])
 
     assert name == kind
     assert abs(float(mesh.vertices[:, 2].min())) < 1e-6

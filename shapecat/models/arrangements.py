@@ -163,7 +163,7 @@ def _place_on_table(options: ArrangementOptions, rng: np.random.Generator) -> li
 def _make(options: ArrangementOptions, rng: np.random.Generator, size: float) -> ArrangedObject:
     """Make a random object or distractor, scaled by ``size``."""
     if rng.random() < options.unknown:
-        _, mesh = make_distractor(rng, str(rng.choice(list(options.kinds))))
+        _, mesh = make_distractor(rng, options.kinds)
         return _at_rest(scaled(mesh, size), UNKNOWN, options, rng)
     label = str(rng.choice(list(CATEGORIES)))
     return _at_rest(scaled(make_object(label, rng), size), label, options, rng)

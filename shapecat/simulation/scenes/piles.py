@@ -13,15 +13,13 @@ from shapecat.simulation.scenes.paths import Filming, arc_orbit
 from shapecat.simulation.scenes.physics import Drop, SettledPose, settle
 from shapecat.simulation.scenes.worlds import PlacedObject, Support, World
 from shapecat.simulation.shapes.categories import make_object
-from shapecat.simulation.shapes.distractors import DISTRACTORS, make_distractor
+from shapecat.simulation.shapes.distractors import KINDS, make_distractor
 from shapecat.simulation.shapes.mesh import Mesh
 from shapecat.simulation.shapes.randomness import log_uniform, random_rotation
 from shapecat.types import UNKNOWN
 
-__all__ = ["KINDS", "Item", "bin_picking", "make_item", "pile", "settled", "shelf_bin"]
+__all__ = ["Item", "bin_picking", "make_item", "pile", "settled", "shelf_bin"]
 
-KINDS = tuple(DISTRACTORS)
-"""Kinds of objects outside the categories."""
 _UPRIGHT = 0.45
 """Fraction of the objects that are dropped nearly upright; others get a random rotation."""
 _TILT_DEG = 8.0
@@ -117,7 +115,7 @@ def shelf_bin(
 def make_item(category: str, rng: Generator, kinds: Sequence[str]) -> Item:
     """Make an object of a category; for ``unknown``, a distractor of one of the kinds."""
     if category == UNKNOWN:
-        return Item(category, *make_distractor(rng, str(rng.choice(list(kinds)))))
+        return Item(category, *make_distractor(rng, kinds))
     return Item(category, category, make_object(category, rng))
 
 

@@ -20,8 +20,9 @@ from shapecat.simulation.scenes.equipment import (
 from shapecat.simulation.scenes.furniture import as_equipment, make_room, make_table, make_wall
 from shapecat.simulation.scenes.paths import Filming, arc_orbit
 from shapecat.simulation.scenes.physics import Drop
-from shapecat.simulation.scenes.piles import KINDS, Item, make_item, settled
+from shapecat.simulation.scenes.piles import Item, make_item, settled
 from shapecat.simulation.scenes.worlds import Support, World, pose_from_yaw
+from shapecat.simulation.shapes.distractors import KINDS
 from shapecat.simulation.shapes.mesh import Mesh
 from shapecat.types import UNKNOWN
 

@@ -1,6 +1,6 @@
 """Distractors: objects outside the seven categories, which a model must call *unknown*."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.random import Generator
@@ -12,28 +12,26 @@ from shapecat.simulation.shapes.randomness import log_uniform
 from shapecat.simulation.shapes.tools import TOOLS
 from shapecat.simulation.shapes.toys import TOYS
 
-__all__ = ["DISTRACTORS", "make_distractor"]
+__all__ = ["DISTRACTORS", "KINDS", "make_distractor"]
 
 DISTRACTORS: dict[str, Callable[[Generator], Mesh]] = {**KITCHEN, **TOOLS, **TOYS}
 """For each kind of object outside the categories, the function that makes a random one."""
+KINDS = tuple(DISTRACTORS)
 
 
-def make_distractor(rng: Generator, kind: str | None = None) -> tuple[str, Mesh]:
+def make_distractor(rng: Generator, kinds: Sequence[str] = KINDS) -> tuple[str, Mesh]:
     """Make a random object outside the categories; return its kind and mesh.
 
-    Parameters
-    ----------
-    kind : one of `DISTRACTORS` or `PROCEDURAL`; by default a random one of `DISTRACTORS`.
+    Its kind is one of ``kinds``, which are names in `DISTRACTORS` or `PROCEDURAL`.
 
     Raises
     ------
     ValueError : the kind does not exist.
     """
-    chosen = str(rng.choice(list(DISTRACTORS))) if kind is None else kind
-    makers = {**DISTRACTORS, **PROCEDURAL}
-    if chosen not in makers:
-        msg = f"no distractor {chosen!r}; known: {', '.join(makers)}"
+    kind, makers = str(rng.choice(kinds)), {**DISTRACTORS, **PROCEDURAL}
+    if kind not in makers:
+        msg = f"no distractor {kind!r}; known: {', '.join(makers)}"
         raise ValueError(msg)
-    mesh = makers[chosen](rng)
+    mesh = makers[kind](rng)
     jitter = np.exp(rng.uniform(-0.12, 0.12, 3))
-    return chosen, standing(scaled(mesh, jitter * log_uniform(rng, 0.75, 1.35)))
+    return kind, standing(scaled(mesh, jitter * log_uniform(rng, 0.75, 1.35)))
