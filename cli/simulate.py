@@ -106,7 +106,7 @@ def simulate(
 
     container = _format_of(out, container)
     # Even without --color, colour labels of another scene must not remain.
-    there = [path for path in written_paths(out, container, color=True) if path.exists()]
+    there = [path for path in written_paths(out, container) if path.exists()]
     if there and not overwrite:
         require_replaceable(there[0])
         msg = f"{there[0]} exists already; --overwrite replaces it"

@@ -19,16 +19,12 @@ from shapecat.types import Camera
 __all__ = ["LabelFile", "completed", "require_replaceable", "written_paths"]
 
 
-def written_paths(out: Path, format: str, *, color: bool = False) -> list[Path]:  # noqa: A002  the word users know
-    """Return the paths that `simulate` writes: the recording, the ground truth, and the labels.
-
-    With ``color``, the labels of the colour images come last.
-    """
+def written_paths(out: Path, format: str) -> list[Path]:  # noqa: A002  the word users know
+    """Return the paths that `simulate` writes: recording, ground truth, labels, colour labels."""
     suffix = CONTAINERS[format].suffix
     out = out if out.suffix or not suffix else out.with_name(out.name + suffix)
-    names = [out.name, f"{out.stem}.truth.json", f"{out.stem}.labels.npz"]
-    names += [f"{out.stem}.color_labels.npz"] if color else []
-    return [out.with_name(name) for name in names]
+    ends = ("truth.json", "labels.npz", "color_labels.npz")
+    return [out, *(out.with_name(f"{out.stem}.{end}") for end in ends)]
 
 
 @contextmanager

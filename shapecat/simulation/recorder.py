@@ -5,7 +5,6 @@ import math
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from shapecat.simulation.scenes.kinds import SceneKind, make_scene
 from shapecat.simulation.scenes.worlds import World
 from shapecat.simulation.truth import frame_truth
 from shapecat.system.progress import Observer, ignore
-from shapecat.types import Camera, Frame, Pose
+from shapecat.types import Frame, Pose
 
 __all__ = ["EPOCH_NS", "record", "robot_links", "simulate", "write_frame"]
 
@@ -125,11 +124,11 @@ def record(
     if format not in CONTAINERS:
         msg = f"no recording format {format!r}; known: {', '.join(CONTAINERS)}"
         raise ValueError(msg)
-    paths = written_paths(out, format, color=color)
-    every = written_paths(out, format, color=True)
+    paths = written_paths(out, format)
+    count = 4 if color else 3
     truths = []
     with (
-        completed(paths, obsolete=every[len(paths) :]) as (recording, truth, *labels),
+        completed(paths[:count], obsolete=paths[count:]) as (recording, truth, *labels),
         CONTAINERS[format].open(recording) as writer,
         ExitStack() as stack,
     ):
@@ -147,7 +146,15 @@ def record(
             files[0].append(image)
             if color:
                 files[1].append(_write_colour(writer, world, frame))
-            truths.append(_truth(world, frame, image, sensor.camera, seed))
+            truths.append(
+                {
+                    "frame": index,
+                    "scene": f"sim{seed}",
+                    "kind": world.kind,
+                    "stamp_ns": frame.stamp_ns,
+                    **frame_truth(world, index, image, sensor.camera),
+                }
+            )
             observe("simulate", index + 1, len(world))
         truth.write_text("[" + ",\n".join(map(json.dumps, truths)) + "]\n", "utf-8")
     return paths[0]
@@ -202,17 +209,6 @@ def _write_colour(writer: Container, world: World, frame: Frame) -> U1:
     image = make.compressed(jpeg(colours), stamp, _COLOUR_OPTICAL)
     writer.write("/camera/color/image_raw/compressed", image, logged)
     return labels
-
-
-def _truth(world: World, frame: Frame, labels: U1, camera: Camera, seed: int) -> dict[str, Any]:
-    """Return the ground truth of a frame; ``labels`` (h, w) are those of its pixels."""
-    return {
-        "frame": frame.index,
-        "scene": f"sim{seed}",
-        "kind": world.kind,
-        "stamp_ns": frame.stamp_ns,
-        **frame_truth(world, frame.index, labels, camera),
-    }
 
 
 def robot_links(world_from_camera: Pose) -> list[tuple[str, str, Pose]]:
