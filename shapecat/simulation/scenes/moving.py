@@ -34,9 +34,7 @@ def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> Worl
         strip = _strip(counter, (middle - 0.3, middle + 0.3), (-0.22, 0.22))
         layout.put(category, strip, _ANYWHERE)
     target = np.array([0, 0, counter.height + 0.05])
-    path = lateral_pass(
-        rng, target, filming, distance=(0.95, 1.2), elevation=(30, 48), amplitude=(0.6, 0.75)
-    )
+    path = lateral_pass(rng, target, filming)
     return World("walking", (*room, counter), tuple(layout.objects), path)
 
 

@@ -61,7 +61,10 @@ def arc_orbit(
     elevation : mean angle of the line of sight below the horizontal, degrees.
     sweep : half the angle of the arc, degrees.
     """
-    distance, elevation, sweep = (_drawn(rng, value) for value in (distance, elevation, sweep))
+    distance, elevation, sweep = (
+        rng.uniform(*value) if isinstance(value, tuple) else value
+        for value in (distance, elevation, sweep)
+    )
     t = filming.times()
     speed = rng.uniform(0.25, 0.6) / distance  # walking speed, radians per second
     width = np.radians(sweep)
@@ -89,27 +92,13 @@ def arc_orbit(
     return tuple(looking_at(e, g, roll=float(r)) for e, g, r in zip(eye, aim, roll, strict=True))
 
 
-def lateral_pass(
-    rng: Generator,
-    target: F8,
-    filming: Filming,
-    *,
-    distance: Range,
-    elevation: Range,
-    amplitude: Range,
-) -> tuple[Pose, ...]:
+def lateral_pass(rng: Generator, target: F8, filming: Filming) -> tuple[Pose, ...]:
     """Move a camera back and forth along a counter that it faces, as if a person carried it.
 
-    Parameters
-    ----------
-    target : (3,) middle of the counter, metres; the camera is on the side of negative y.
-    distance : distance to the counter, metres.
-    elevation : angle of the line of sight below the horizontal, degrees.
-    amplitude : distance from the middle of the counter to the turning points, metres.
+    ``target`` (3,) is the middle of the counter, metres; the camera is on the side of negative y.
     """
-    distance, elevation, amplitude = (
-        _drawn(rng, value) for value in (distance, elevation, amplitude)
-    )
+    distance, elevation = rng.uniform(0.95, 1.2), rng.uniform(30, 48)
+    amplitude = rng.uniform(0.6, 0.75)  # from the middle to the turning points
     t = filming.times()
     speed = rng.uniform(0.4, 0.55)
     side = amplitude * np.sin(speed / amplitude * t + rng.uniform(-np.pi, np.pi))
@@ -121,10 +110,6 @@ def lateral_pass(
     eye = eye + np.column_stack([side, jitter, bob])
     roll = np.radians(0.6 * np.sin(np.pi * 1.8 * t + shift[3]))
     return tuple(looking_at(e, g, roll=float(r)) for e, g, r in zip(eye, aim, roll, strict=True))
-
-
-def _drawn(rng: Generator, value: Range) -> float:
-    return float(rng.uniform(*value) if isinstance(value, tuple) else value)
 
 
 def static_view(
