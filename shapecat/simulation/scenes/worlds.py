@@ -125,11 +125,10 @@ class World(Record):
 
     def pose_of(self, item: PlacedObject, frame: int) -> Pose:
         """Return ``world_from_mesh`` of an object in a frame; an absent object is not shifted."""
-        shift = self._shifts.get(item.track)
         pose = item.pose
-        if shift is not None and np.isfinite(shift[frame]).all():
-            pose = Pose(pose.rotation, pose.translation + shift[frame])
-        turn = self._turn(frame)
+        if item.track in self._shifts and self.present(item, frame):
+            pose = Pose(pose.rotation, pose.translation + self._shifts[item.track][frame])
+        turn = 0.0 if self.turns is None else float(self.turns[frame])
         return compose(pose_from_yaw(turn), pose) if turn else pose
 
     def present(self, item: PlacedObject, frame: int) -> bool:
@@ -160,9 +159,6 @@ class World(Record):
     @cached_property
     def _still(self) -> Geometry:
         return self._gather(0)
-
-    def _turn(self, frame: int) -> float:
-        return 0.0 if self.turns is None else float(self.turns[frame])
 
     def _gather(self, frame: int) -> Geometry:
         objects = [
