@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull
 from shapecat.arrays import Bool
 from shapecat.errors import OutputError
 from shapecat.geometry import compose, inverse, rotation_from_quaternion, transform
+from shapecat.models.meshes import load_mesh, uprighted
 from shapecat.simulation import World, make_scene, render_frame, simulate, truth
 from shapecat.simulation.camera.presets import IDEAL, KINECT
 from shapecat.simulation.camera.render import geometry, render
@@ -29,7 +30,6 @@ from shapecat.simulation.scenes.furniture import make_table
 from shapecat.simulation.scenes.kinds import SCENES, SceneKind
 from shapecat.simulation.shapes.categories import make_object
 from shapecat.simulation.shapes.mesh import Mesh
-from shapecat.simulation.shapes.scans import load_mesh, uprighted
 from shapecat.simulation.shapes.stable_poses import stable_poses
 from shapecat.simulation.truth import AMBIGUOUS_PIXELS, frame_truth
 from shapecat.types import CATEGORIES, Camera, Pose
