@@ -137,9 +137,7 @@ def test_worlds_are_independent_of_number_of_jobs(
 
 def test_training_tables_follow_their_options() -> None:
     """An ignored option would leave the model unchanged without notice."""
-    world = ArrangementOptions(
-        7, ("pan",), unknown=0.0, lying=0.9, leaning=0.5, cameras=1, keep=True
-    )
+    world = ArrangementOptions(7, ("pan",), unknown=0.0, lying=0.9, leaning=0.5, cameras=1)
     views = [view for k in range(4) for view in simulate_arrangement(world, k)]
     resting_poses = [view.resting_pose for view in views if view.label in {"cup", "can", "bottle"}]
 
@@ -233,9 +231,7 @@ def test_thin_background_gives_unknown_views() -> None:
     scene = Arrangement([ArrangedObject(box, "box", "upright", 0.0)], around, (30, 50))
 
     views, objects = (
-        describe_arrangement(
-            scene, "a", cameras=4, rng=np.random.default_rng(2), background=wanted, keep=True
-        )
+        describe_arrangement(scene, "a", cameras=4, rng=np.random.default_rng(2), background=wanted)
         for wanted in (True, False)
     )
     found = [view for view in views if view.source == "background"]

@@ -52,7 +52,6 @@ class ArrangementOptions:
         tables in rooms.
     cameras : number of images of each arrangement.
     background : whether to add thin detections of furniture and noise as views of ``unknown``.
-    keep : whether to keep the points of the views.
     """
 
     seed: int
@@ -63,7 +62,6 @@ class ArrangementOptions:
     settled: float = 0.0
     cameras: int = 4
     background: bool = False
-    keep: bool = False
 
 
 class ArrangedObject(NamedTuple):

@@ -1,7 +1,6 @@
 """Evaluate a model on held-out data, and write the results into its card."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -104,7 +103,7 @@ def evaluate_model(
 
 def _test_views() -> list[SimulatedView]:
     """Return the clear views, with points, of a few test arrangements; see `clear_views`."""
-    options = replace(options_of("test"), keep=True)
+    options = options_of("test")
     views = [view for number in range(_DRAWN) for view in simulate_arrangement(options, number)]
     return [view for view, clear in zip(views, clear_views(collect(views)), strict=True) if clear]
 

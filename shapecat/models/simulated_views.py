@@ -74,7 +74,7 @@ class SimulatedView(NamedTuple):
     overlap : IoU of the detection and the object's depth pixels, for a fragment before it was cut;
         1 for views that are not from a detection, and for background.
     sensor : name of the sensor.
-    view : the voxels; None if not kept.
+    view : the voxels; None in the views of `simulate_views`.
     """
 
     descriptor: F4
@@ -105,9 +105,10 @@ def simulate_views(
 ) -> Iterator[SimulatedView]:
     """Simulate the arrangements with these numbers; yield their views in this order.
 
-    The number of jobs does not affect the result.
+    The views are without points, which would fill the memory. The number of jobs does not affect
+    the result.
     """
-    one = partial(simulate_arrangement, options)
+    one = partial(_simulate_without_points, options)
     if jobs <= 1:
         for number in numbers:
             yield from one(number)
@@ -117,17 +118,16 @@ def simulate_views(
             yield from views
 
 
+def _simulate_without_points(options: ArrangementOptions, number: int) -> list[SimulatedView]:
+    return [view._replace(view=None) for view in simulate_arrangement(options, number)]
+
+
 def simulate_arrangement(options: ArrangementOptions, number: int) -> list[SimulatedView]:
     """Simulate one arrangement and describe its objects from several viewpoints."""
     rng = np.random.default_rng((options.seed, number))
     arrangement, name = arrange(options, rng), f"{options.seed}/{number}"
     return describe_arrangement(
-        arrangement,
-        name,
-        cameras=options.cameras,
-        rng=rng,
-        background=options.background,
-        keep=options.keep,
+        arrangement, name, cameras=options.cameras, rng=rng, background=options.background
     )
 
 
@@ -161,7 +161,6 @@ def describe_arrangement(
     cameras: int,
     rng: np.random.Generator,
     background: bool = False,
-    keep: bool = False,
 ) -> list[SimulatedView]:
     """Describe the objects of an arrangement from several viewpoints.
 
@@ -172,7 +171,6 @@ def describe_arrangement(
     name : prefix of the instance names.
     cameras : number of viewpoints, each with its own sensor.
     background : whether to add thin detections that show no object, as unknown.
-    keep : whether to keep the points of the views.
     """
     objects = arrangement.objects
     if not objects:
@@ -188,7 +186,7 @@ def describe_arrangement(
                 views += _views_of(image, scene, k, item, f"{name}/{k}", rng)
         if background:
             views += _background(image, scene, len(objects), f"{name}/background")
-    return views if keep else [view._replace(view=None) for view in views]
+    return views
 
 
 def _views_of(
