@@ -1,8 +1,8 @@
 """The model card: the training data of the default model, its accuracy and its weaknesses."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from shapecat.evaluation import Report
 
@@ -50,13 +50,12 @@ The views of the test set with the most confident wrong labels. Colour shows the
 """
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """A table of the card, with its title."""
 
     title: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
 
 
 def format_table(table: Table) -> str:
@@ -90,19 +89,15 @@ def write_card(
     settings : settings of the training, by name.
     """
     head = _HEAD.format(model=model, categories=", ".join(categories), picture=PICTURE)
-    rows = tuple(
-        (name, *map(str, row))
-        for name, row in zip(confusion.categories, confusion.confusion, strict=True)
-    )
     confusion_table = Table(
         "Confusion on clear views of the test set (true category in rows)",
         ("", *confusion.categories),
-        rows,
+        [
+            (name, *map(str, row))
+            for name, row in zip(confusion.categories, confusion.confusion, strict=True)
+        ],
     )
-    settings_table = Table(
-        "Settings",
-        ("setting", "value"),
-        tuple((name, str(value)) for name, value in settings.items()),
-    )
+    rows = [(name, str(value)) for name, value in settings.items()]
+    settings_table = Table("Settings", ("setting", "value"), rows)
     parts = [head, *map(format_table, (*tables, confusion_table, settings_table))]
     path.write_text("\n".join(parts), "utf-8")

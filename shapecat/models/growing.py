@@ -17,6 +17,7 @@ __all__ = ["Growth", "collect_chunks", "grow", "growing_options"]
 
 _T = TypeVar("_T")
 
+_CHUNK = 10
 _L2, _MIN_HESSIAN = 1.0, 2.0
 _ROWS = 0.7
 """Fraction of the samples that each tree is trained on."""
@@ -47,18 +48,16 @@ def growing_options(out: Path) -> Callable[[Callable[..., Any]], Callable[..., A
     return add
 
 
-def collect_chunks(
-    collect: Callable[[Any], _T], series: Iterable[Any], size: int, jobs: int
-) -> list[_T]:
+def collect_chunks(collect: Callable[[Any], _T], series: Iterable[Any], jobs: int) -> list[_T]:
     """Collect samples from series of scenes in spawned processes, and show the progress.
 
     A series has a ``first`` seed and a number of ``scenes``. Each call of ``collect`` gets a part
-    of a series, of at most ``size`` scenes. The results are in the order of the series.
+    of a series, of at most `_CHUNK` scenes. The results are in the order of the series.
     """
     chunks = [
-        one._replace(first=one.first + k, scenes=min(size, one.scenes - k))
+        one._replace(first=one.first + k, scenes=min(_CHUNK, one.scenes - k))
         for one in series
-        for k in range(0, one.scenes, size)
+        for k in range(0, one.scenes, _CHUNK)
     ]
     with (
         ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool,

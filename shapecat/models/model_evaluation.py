@@ -79,8 +79,8 @@ def evaluate_model(
         views = describe_views(detected_views(folder), settings=Settings())
         rows.append(_figures(f"{folder.name}, as detected", evaluate(views, model)))
     tables = [
-        Table("Views", ("set", "views", "objects", "unknown"), tuple(_counts(sets))),
-        Table("Accuracy on unseen objects, single views", _HEAD, tuple(rows)),
+        Table("Views", ("set", "views", "objects", "unknown"), _counts(sets)),
+        Table("Accuracy on unseen objects, single views", _HEAD, rows),
         _fused_table(tracks, model),
     ]
     clear = evaluate(sets["test"].where(clear_views(sets["test"])).views, model)
@@ -182,6 +182,5 @@ def _fused_table(tracks: dict[str, SimulatedViews], model: Categorizer) -> Table
             for item in report.fused
         ]
     head = ("data", "views fused", "groups", "accuracy", "ECE")
-    return Table(
-        "Several fused views of one placement of an object, fused as in tracks", head, tuple(rows)
-    )
+    title = "Several fused views of one placement of an object, fused as in tracks"
+    return Table(title, head, rows)

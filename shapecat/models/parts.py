@@ -45,7 +45,6 @@ _PURE = 0.6
 """A segment belongs to an object that owns more than this fraction of its cells."""
 _NOISY = replace(IDEAL, noise=0.0015, step=0.0029)
 _BLENDED = replace(IDEAL, noise=0.0015, blend_px=3)
-_CHUNK = 10
 _GROWTH = Growth(300, 256, 0.1)
 _SETTINGS = DetectionSettings()
 
@@ -116,7 +115,7 @@ def main(*, seed: int, jobs: int, out: Path) -> None:
 
 def collect(scenes: Sequence[Series], jobs: int) -> Pairs:
     """Return the pairs of segments of all scenes; the number of jobs does not affect the result."""
-    both = collect_chunks(_collect, scenes, _CHUNK, jobs)
+    both = collect_chunks(_collect, scenes, jobs)
     return Pairs(np.concatenate([p.features for p in both]), np.concatenate([p.same for p in both]))
 
 

@@ -122,7 +122,7 @@ def _visible_fractions(
     an image twice as wide and high in which nothing occludes it. It is 0 for an object with fewer
     than `_FEWEST_PIXELS` depth pixels.
     """
-    seen_pixels = np.bincount(mesh_ids[mesh_ids >= 0], minlength=count + 1)
+    seen_pixels = np.bincount(mesh_ids[mesh_ids >= 0], minlength=count)[:count]
     width, height = camera.width // _COARSE, camera.height // _COARSE
     wide = Camera(
         2 * width,
@@ -133,12 +133,11 @@ def _visible_fractions(
         camera.cy / _COARSE + height // 2,
     )
     result = np.zeros(count)
-    for k in range(count):
+    for k in np.flatnonzero(seen_pixels >= _FEWEST_PIXELS):
         of_object = geometry.mesh_ids == k
         alone = Geometry(
             geometry.vertices, geometry.triangles[of_object], geometry.mesh_ids[of_object]
         )
         total = int((render(alone, wide, pose).mesh_ids >= 0).sum()) * _COARSE**2
-        if seen_pixels[k] >= _FEWEST_PIXELS:
-            result[k] = min(1.0, seen_pixels[k] / max(total, 1))
+        result[k] = min(1.0, seen_pixels[k] / max(total, 1))
     return result

@@ -49,7 +49,6 @@ _FOLDS = 3
 """Number of folds; the segments of each get logits from trees that are trained on the others."""
 _OBJECT = 0.5
 """A merged segment is an object if more than this fraction of its labelled cells shows objects."""
-_CHUNK = 10
 
 
 class Series(NamedTuple):
@@ -167,7 +166,7 @@ def collect(scenes: tuple[Series, ...], jobs: int) -> list[Samples]:
 
     Each `Samples` holds whole scenes, so that no scene is in two folds.
     """
-    return collect_chunks(_collect, scenes, _CHUNK, jobs)
+    return collect_chunks(_collect, scenes, jobs)
 
 
 def grow_rejection_trees(samples: Sequence[Samples], seed: int) -> RejectionTrees:
