@@ -28,7 +28,7 @@ SHARDS = 4
 def make(folder: Path, *, recordings: int, broken: int, frames: int) -> Path:
     """Write recordings of all formats, ``broken`` of which cannot be read; return the folder."""
     folder.mkdir()
-    views, _ = tabletop(60)
+    views = tabletop(60)
     for k in range(recordings - broken):
         start = (7 * k) % 60
         turned = [*views[start:], *views[:start]]

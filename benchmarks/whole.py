@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 from dataclasses import replace
-from itertools import cycle, islice
+from itertools import count, cycle, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,11 +26,10 @@ from benchmarks.measure import markdown
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.containers import CONTAINERS
 from shapecat.simulation.recorder import write_frame
-from shapecat.simulation.scenes.worlds import World
 from shapecat.types import Frame, Pose
 
 EPOCH_NS, PERIOD_NS = 1_700_000_000_000_000_000, 33_333_333
-SEED = 11
+SEED, OBJECTS = 11, 8
 FEW_S = 0.1  # seconds of recording in the run that measures start-up
 REPEATS, MANY = 3, 1000  # repetitions for recordings with fewer than MANY frames
 THESIS = "thesis (2012): 0.2 s to find planes and objects, up to 2 s for each of 8 objects"
@@ -43,29 +42,18 @@ class View(NamedTuple):
     pose: Pose
 
 
-def find_world(frames: int, objects: int) -> World:
-    """Return the first of 100 simulated scenes with this number of objects, else the last one."""
-    for seed in range(SEED, SEED + 100):
-        world = make_scene("tabletop", np.random.default_rng(seed), frames=frames)
-        if len(world.objects) == objects:
-            break
-    return world
-
-
-def tabletop(frames: int, *, objects: int = 8) -> tuple[list[View], int]:
-    """Render a table from a moving camera; return the views and the number of objects."""
-    world, views = find_world(frames, objects), []
+def tabletop(frames: int, *, still: bool = False) -> list[View]:
+    """Render a table with eight objects from a moving or still camera."""
+    worlds = (
+        make_scene("tabletop", np.random.default_rng(seed), frames=frames) for seed in count(SEED)
+    )
+    world = next(world for world in worlds if len(world.objects) == OBJECTS)
+    views = []
     for k in range(frames):
-        frame, _ = render_frame(world, k, rng=np.random.default_rng(k), sensor=KINECT)
-        views.append(View(frame, world.path[k]))
-    return views, len(world.objects)
-
-
-def standing(frames: int, *, objects: int = 8) -> list[View]:
-    """Render the table of `tabletop` from one position; the views differ only in noise."""
-    world = find_world(frames, objects)
-    sees = (np.random.default_rng(k) for k in range(frames))
-    return [View(render_frame(world, 0, rng=rng, sensor=KINECT)[0], world.path[0]) for rng in sees]
+        at = 0 if still else k
+        frame, _ = render_frame(world, at, rng=np.random.default_rng(k), sensor=KINECT)
+        views.append(View(frame, world.path[at]))
+    return views
 
 
 def write(path: Path, views: list[View], frames: int, *, container: str = "mcap") -> Path:
@@ -117,19 +105,19 @@ def spend(
 
 def speed(folder: Path, frames: int, repeats: int, against: Path | None) -> str:
     """Return a table of the frames per second with all outputs, on one core and on two."""
-    views, objects = tabletop(60)
     rows: list[tuple[Any, ...]] = []
-    for camera, seen in (("walking", views), ("still", standing(60))):
-        recording = write(folder / f"{camera}.mcap", seen, frames)
-        for count in (1, 2):
-            cores = set(sorted(os.sched_getaffinity(0))[:count])
-            if len(cores) == count:
+    for camera in ("walking", "still"):
+        views = tabletop(60, still=camera == "still")
+        recording = write(folder / f"{camera}.mcap", views, frames)
+        for number in (1, 2):
+            cores = set(sorted(os.sched_getaffinity(0))[:number])
+            if len(cores) == number:
                 rates = _measure(recording, folder, cores, repeats, against)
-                rows.append((camera, count, *rates))
+                rows.append((camera, number, *rates))
         recording.unlink()
     ratios = ("ratio", "CPU ratio") if against else ()
     columns = ("camera", "cores", "frames/s", "CPU ms/frame", "start-up s", "peak MB", *ratios)
-    title = f"End to end, {objects} objects, 640×480, all outputs, {frames} frames"
+    title = f"End to end, {OBJECTS} objects, 640×480, all outputs, {frames} frames"
     return markdown(title, columns, rows) + f"\n{THESIS}.\n"
 
 
@@ -161,7 +149,7 @@ def _measure(
 
 def growth(folder: Path, counts: list[int]) -> str:
     """Return a table of CPU time per additional frame and peak memory, by number of frames."""
-    views, _ = tabletop(60)
+    views = tabletop(60)
     cores = set(sorted(os.sched_getaffinity(0))[:1])
     rows = []
     done, cpu_s = 0, 0.0
