@@ -7,7 +7,7 @@ recordings. The picture shows a frame of each as shaded surfaces, which show noi
 best.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -131,17 +131,6 @@ def _step_widths(inverse: Array, width: int) -> Array:
     return np.asarray(widths[(part > 0).all(axis=1)])
 
 
-def _simulated(name: str, first: int, count: int) -> Iterator[Figures]:
-    for seed in range(first, first + count):
-        _, frame, _ = simulated_frame("pile", seed, PRESETS[name])
-        yield measure_frame(np.asarray(frame.depth, np.float64))
-
-
-def _recorded(folder: Path) -> Iterator[Figures]:
-    for frame in _frames(folder):
-        yield measure_frame(np.asarray(frame.depth, np.float64))
-
-
 def _frames(folder: Path) -> Iterator[Frame]:
     """Yield the depth images of the recordings in a folder."""
     for path in sorted(folder.rglob("*.mcap")):
@@ -184,8 +173,9 @@ def draw(path: Path, seed: int, real: tuple[Path, ...]) -> None:
     figure.savefig(path, dpi=70)
 
 
-def _row(name: str, figures: list[Figures]) -> tuple[Any, ...]:
-    middle = np.nanmedian(np.array(figures), axis=0)
+def _row(name: str, frames: Iterable[Frame]) -> tuple[Any, ...]:
+    figures = [measure_frame(np.asarray(frame.depth, np.float64)) for frame in frames]
+    middle = np.nanmedian(figures, axis=0)
     return (name, len(figures), *(f"{value:.2g}" for value in middle))
 
 
@@ -203,8 +193,12 @@ def main(first: int, count: int, real: tuple[Path, ...], picture: Path | None) -
     """Measure simulated and real depth images, and print a table."""
     if picture is not None:
         draw(picture, first, real)
-    rows = [_row(name, list(_simulated(name, first, count))) for name in PRESETS]
-    rows += [_row(folder.name, list(_recorded(folder))) for folder in real]
+    seeds = range(first, first + count)
+    rows = [
+        _row(name, (simulated_frame("pile", seed, sensor)[1] for seed in seeds))
+        for name, sensor in PRESETS.items()
+    ]
+    rows += [_row(folder.name, _frames(folder)) for folder in real]
     click.echo(markdown("Depth images, medians over frames", HEAD, rows))
 
 
