@@ -39,7 +39,7 @@ def evaluate(world: World, sensor: Sensor, range_m: tuple[float, float], seed: i
 def row(worlds: Sequence[World], first: int, range_m: tuple[float, float]) -> tuple[Any, ...]:
     """Return the row of the table for a range of distances, metres; ``first`` is the first seed."""
     sensors = [s for s in PRESETS.values() if s.nearest_m < range_m[1] - MARGIN_M]
-    total = Counts(0, 0, 0, 0, 0, 0, 0.0)
+    total = Counts()
     for k, world in enumerate(worlds):
         sensor = sensors[k // len(KINDS) % len(sensors)]
         total += evaluate(world, sensor, range_m, first + k)

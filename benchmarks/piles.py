@@ -78,7 +78,7 @@ def figures(found: list[ScoredObject], overlap: Overlap, model: Categorizer) -> 
         "upright or lying": _right([o for o in known if not o.placed.tilted], model),
         "tilted": _right(tilted, model),
         "tilted objects": len(tilted),
-        "AUROC": auroc(_novelty(strange), _novelty(known)) if strange and known else float("nan"),
+        "AUROC": auroc(_novelty(strange), _novelty(known)),
         "ECE": _calibration(known, model),
     }
 

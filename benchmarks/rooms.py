@@ -36,13 +36,13 @@ class Counts(NamedTuple):
     f : sum of the overlap F of these objects, 0 for missed ones.
     """
 
-    frames: int
-    detections: int
-    elsewhere: int
-    pieces: int
-    objects: int
-    found: int
-    f: float
+    frames: int = 0
+    detections: int = 0
+    elsewhere: int = 0
+    pieces: int = 0
+    objects: int = 0
+    found: int = 0
+    f: float = 0.0
 
     def __add__(self, other: Any) -> "Counts":
         """Return the sums."""
@@ -87,13 +87,12 @@ def count(detections: list[Array], labels: Array) -> Counts:
 def main(first: int, rooms: int, model: Path | None) -> None:
     """Count surplus detections in rooms, and print a table."""
     categorizer, settings = load_model(model), Settings()
-    found = {name: Counts(0, 0, 0, 0, 0, 0, 0.0) for name in PRESETS}
+    found = dict.fromkeys(PRESETS, Counts())
     for k in range(rooms):
         name = list(PRESETS)[k % len(PRESETS)]
         found[name] += evaluate(name, first + k, categorizer, settings)
-    total = Counts(*(sum(column) for column in zip(*found.values(), strict=True)))
     rows = [counts.row(name) for name, counts in found.items() if counts.frames]
-    click.echo(markdown("Rooms", HEAD, [*rows, total.row("all")]))
+    click.echo(markdown("Rooms", HEAD, [*rows, sum(found.values(), Counts()).row("all")]))
 
 
 if __name__ == "__main__":

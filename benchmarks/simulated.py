@@ -20,7 +20,7 @@ from shapecat.config import DetectionSettings
 from shapecat.geometry import inverse
 from shapecat.simulation import KINECT
 from shapecat.simulation.scenes.kinds import SceneKind
-from shapecat.simulation.scenes.worlds import PlacedObject, World
+from shapecat.simulation.scenes.worlds import World
 from shapecat.types import Frame, Scene
 
 HIT_IOU = 0.5
@@ -137,7 +137,6 @@ def _score_relations(view: View, matches: dict[int, int], total: Counter[str]) -
 
     Objects on an object that was not found are left out; ``matches`` are from `_matches`.
     """
-    by_track = {t.track: t for t in view.world.objects}
     heights = {s.name: s.height for s in view.world.supports if s.holds_objects}
     found = _heights(view)
     for item in view.world.objects:
@@ -148,17 +147,13 @@ def _score_relations(view: View, matches: dict[int, int], total: Counter[str]) -
             height = np.inf if candidate.plane is None else found[candidate.plane]
             apart = abs(height - heights[item.on_support])
             right = candidate.on_candidate is None and bool(apart < SAME_HEIGHT_M)
-        else:
-            below = _label_of(by_track, item)
+        elif item.on_track is not None:
+            below = view.world.objects[item.on_track].label
             if below not in matches:
                 continue
             right = candidate.on_candidate == matches[below]
         total["relations"] += 1
         total["right relations"] += right
-
-
-def _label_of(by_track: dict[int, PlacedObject], item: PlacedObject) -> int:
-    return by_track[item.on_track].label if item.on_track is not None else 0
 
 
 if __name__ == "__main__":
