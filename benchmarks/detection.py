@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.measure import cpu_ms, markdown, summary
 from benchmarks.open3d_clusters import cluster_above_plane
-from benchmarks.scenes import real_tables, simulated_clutter
+from benchmarks.scenes import labelled_clutter, real_tables
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.types import Frame
@@ -27,7 +27,7 @@ RANGE_M = 2.0
 def run(count: int) -> str:
     """Time every method on every frame; return a Markdown table."""
     sets = {
-        "simulated clutter": list(simulated_clutter(count)),
+        "simulated clutter": [labelled.frame for labelled in labelled_clutter(count)],
         "real tables": list(real_tables(every=max(1, 45 // count))),
     }
     rows = []

@@ -49,11 +49,6 @@ def detected(frame: Frame) -> Scene:
     return detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0))
 
 
-def simulated_clutter(count: int, first_seed: int = 500) -> Iterator[Frame]:
-    """Yield a Kinect frame of each of ``count`` cluttered tables."""
-    return (labelled.frame for labelled in labelled_clutter(count, first_seed))
-
-
 def real_tables(every: int = 1) -> Iterator[Frame]:
     """Yield real Kinect frames of tables; none if the data are missing."""
     path = SHARED / "osd_learn" / "depth.mcap"
@@ -64,7 +59,7 @@ def real_tables(every: int = 1) -> Iterator[Frame]:
 
 
 def labelled_clutter(count: int, first_seed: int = 500) -> Iterator[Labelled]:
-    """Yield the frames of `simulated_clutter` with their labels."""
+    """Yield a Kinect frame of each of ``count`` cluttered tables."""
     for seed in range(first_seed, first_seed + count):
         world, frame, labels = simulated_frame("clutter", seed, KINECT)
         seen = np.bincount(labels, minlength=256)

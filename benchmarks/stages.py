@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import cpu_ms, markdown, summary
-from benchmarks.scenes import simulated_clutter
+from benchmarks.scenes import labelled_clutter
 from shapecat.arrays import F4, F8
 from shapecat.config import Settings
 from shapecat.description import describe
@@ -24,7 +24,7 @@ def run(count: int) -> str:
     settings, model = Settings(), load_model(None)
     timed: dict[str, list[float]] = {}
     objects: list[tuple[F4, F8]] = []
-    for frame in simulated_clutter(count):
+    for frame, *_ in labelled_clutter(count):
         scene = detect(frame, settings=settings.detection, rng=np.random.default_rng(0))
         for candidate in scene.candidates[:4]:
             points, level = level_points(frame, scene, candidate)
