@@ -21,11 +21,8 @@ import pyarrow.parquet as pq
 from scipy.optimize import linear_sum_assignment
 
 from benchmarks.measure import markdown
-from benchmarks.scenes import SEEN_PIXELS, Array
+from benchmarks.scenes import SEEN_PIXELS, Array, make_run
 from shapecat.evaluation.comparison.overlap import box_iou
-from shapecat.pipeline import process
-from shapecat.runs.jobs import Job
-from shapecat.simulation import simulate
 from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.types import Box
 
@@ -84,10 +81,7 @@ def _evaluate_kind(kind: SceneKind, first: int, count: int) -> Iterator[ScoredOb
     for seed in range(first, first + count):
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
-            source = simulate(
-                folder / "recording.mcap", scene=kind, frames=FRAMES, seed=seed, rate_hz=RATE_HZ
-            )
-            process(Job(source, folder / "run", mcap=False, rrd=False))
+            make_run(folder, scene=kind, frames=FRAMES, seed=seed, rate_hz=RATE_HZ)
             for item in _evaluate_run(folder, seed):
                 yield item._replace(group=f"{kind}, {_HOW[kind] if item.group else 'upright'}")
 

@@ -20,17 +20,14 @@ import numpy as np
 
 from benchmarks.boxes import by_frame, matches
 from benchmarks.measure import markdown
-from benchmarks.scenes import SEEN_PIXELS
+from benchmarks.scenes import SEEN_PIXELS, make_run
 from shapecat.outputs.colouring import with_colour
 from shapecat.outputs.exports.dataset_frames import snapped_masks
-from shapecat.pipeline import process
 from shapecat.recordings import open_recording
 from shapecat.recordings.decoding.colour_image import pixels_of
 from shapecat.runs.folder import read_run
-from shapecat.runs.jobs import Job
 from shapecat.runs.labelled_frames import read_labelled_frames
 from shapecat.runs.labels.corrections import read_labels
-from shapecat.simulation import simulate
 from shapecat.simulation.scenes.kinds import SceneKind
 
 SEEN_ON_IMAGE = 300
@@ -71,16 +68,9 @@ def _evaluate(number: int, seed: int) -> Iterator[ScoredObject]:
     kind, sensor = KINDS[number % 2], SENSORS[number // 2 % 2]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        source = simulate(
-            folder / "recording.mcap",
-            scene=kind,
-            frames=FRAMES,
-            seed=seed,
-            sensor=sensor,
-            color=True,
-            rate_hz=RATE_HZ,
+        make_run(
+            folder, scene=kind, sensor=sensor, color=True, frames=FRAMES, seed=seed, rate_hz=RATE_HZ
         )
-        process(Job(source, folder / "run", mcap=False, rrd=False))
         for found, overlaps in _evaluate_run(folder):
             yield ScoredObject(sensor, found, overlaps)
 

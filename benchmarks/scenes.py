@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
+from shapecat.pipeline import process
 from shapecat.recordings import FrameRange, choose_streams, frames, open_recording
-from shapecat.simulation import KINECT, Sensor, World, make_scene, render_frame
+from shapecat.runs.jobs import Job
+from shapecat.simulation import KINECT, Sensor, World, make_scene, render_frame, simulate
 from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.simulation.scenes.worlds import FIRST_OBJECT_LABEL
 from shapecat.types import Frame, Scene
@@ -36,6 +38,15 @@ def simulated_frame(kind: SceneKind, seed: int, sensor: Sensor) -> tuple[World, 
     world = make_scene(kind, rng, frames=1)
     frame, labels = render_frame(world, 0, rng=rng, sensor=sensor)
     return world, frame, labels.reshape(-1)
+
+
+def make_run(folder: Path, **options: Any) -> None:
+    """Simulate ``recording.mcap`` in a folder, and process it into ``run``, without its outputs.
+
+    ``options`` are those of `simulate`.
+    """
+    source = simulate(folder / "recording.mcap", **options)
+    process(Job(source, folder / "run", mcap=False, rrd=False))
 
 
 def object_masks(labels: Array) -> list[Array]:

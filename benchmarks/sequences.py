@@ -19,13 +19,11 @@ import pyarrow.parquet as pq
 from scipy.optimize import linear_sum_assignment
 
 from benchmarks.measure import markdown
+from benchmarks.scenes import make_run
 from shapecat.arrays import F8, U1
 from shapecat.evaluation.comparison.identities import FrameIdentities, compute_tracking_metrics
 from shapecat.evaluation.metrics import expected_calibration_error
-from shapecat.pipeline import process
-from shapecat.runs.jobs import Job
 from shapecat.runs.labels.track_table import read_track_table
-from shapecat.simulation import simulate
 from shapecat.simulation.scenes.kinds import SceneKind
 from shapecat.simulation.truth import AMBIGUOUS_PIXELS, AMBIGUOUS_SHARE
 from shapecat.tracking.fusion import fuse, view_weights
@@ -84,14 +82,6 @@ class View:
     posterior: F8
     single: str
     final: str
-
-
-def make_sequence(folder: Path, kind: SceneKind, seed: int) -> None:
-    """Write a recording, its ground truth, and the tables of its run."""
-    source = simulate(
-        folder / "recording.mcap", scene=kind, frames=FRAMES, seed=seed, rate_hz=RATE_HZ
-    )
-    process(Job(source, folder / "run", mcap=False, rrd=False))
 
 
 def read_truth(folder: Path) -> list[list[Object]]:
@@ -255,7 +245,7 @@ def evaluate(folder: Path, seeds: Iterable[int]) -> dict[str, Any]:
     for seed in seeds:
         for kind in KINDS:
             place = folder / kind / str(seed)
-            make_sequence(place, kind, seed)
+            make_run(place, scene=kind, frames=FRAMES, seed=seed, rate_hz=RATE_HZ)
             seen.setdefault(kind, []).extend(frame_identities(place, read_truth(place)))
             views += read_views(place, kind, seed)
             click.echo(f"{kind} {seed}", err=True)
