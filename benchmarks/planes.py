@@ -22,7 +22,7 @@ from shapecat.simulation.camera.render import render
 from shapecat.simulation.scenes.furniture import WALL, make_room, make_table
 from shapecat.simulation.scenes.paths import looking_at
 from shapecat.simulation.shapes.categories import make_object
-from shapecat.simulation.shapes.mesh import moved
+from shapecat.simulation.shapes.parts import placed
 from shapecat.simulation.shapes.primitives import rounded_box
 from shapecat.types import CATEGORIES, Camera, Frame, Pose, Scene
 
@@ -119,8 +119,8 @@ def counter(rng: Generator) -> World:
     front = rounded_box([2 * half[0], 0.02, height - 0.05], fine=10)
     supports = (
         table,
-        Support("wall", WALL, moved(wall, Pose(np.eye(3), np.array([0, half[1] + 0.01, 0])))),
-        Support("front", WALL, moved(front, Pose(np.eye(3), np.array([0, 0.03 - half[1], 0])))),
+        Support("wall", WALL, placed(wall, [0, half[1] + 0.01, 0])),
+        Support("front", WALL, placed(front, [0, 0.03 - half[1], 0])),
     )
     objects = []
     for k, x in enumerate(rng.permutation(np.linspace(-0.4, 0.4, 5))[: rng.integers(2, 6)]):

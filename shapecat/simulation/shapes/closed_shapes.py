@@ -5,6 +5,7 @@ from numpy.random import Generator
 
 from shapecat.arrays import F8
 from shapecat.simulation.shapes.mesh import Mesh, join, moved, standing
+from shapecat.simulation.shapes.parts import placed
 from shapecat.simulation.shapes.primitives import extrude, lathe, rounded_box, smooth_path, tube
 from shapecat.simulation.shapes.randomness import log_uniform, with_random_yaw
 from shapecat.types import Pose
@@ -231,10 +232,10 @@ def _trigger(rng: Generator, radius: float, height: float) -> list[Mesh]:
     long, tall = radius * rng.uniform(1.2, 1.9), rng.uniform(0.022, 0.035)
     thick = rng.uniform(0.018, 0.026)
     head = rounded_box([long, thick, tall], radius=0.004, fine=2)
-    place = Pose(np.eye(3), np.array([0.25 * long, 0, height - 0.004]))
     x = 0.55 * long
     lever = [[x, 0, height + 0.004], [x + 0.008, 0, height - 0.02], [x + 0.002, 0, height - 0.045]]
-    return [moved(head, place), tube(smooth_path(lever, 6), 0.004, segments=6)]
+    head = placed(head, [0.25 * long, 0, height - 0.004])
+    return [head, tube(smooth_path(lever, 6), 0.004, segments=6)]
 
 
 def make_box(rng: Generator) -> Mesh:
@@ -285,5 +286,4 @@ def _gable_carton(rng: Generator) -> Mesh:
     side = extrude(np.array(outline) * width, width)
     stand = moved(side, Pose(np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]), np.zeros(3)))
     ridge = rounded_box([0.004, width, 0.015], fine=1)
-    fin = moved(ridge, Pose(np.eye(3), np.array([0, -width / 2, high - 0.002])))
-    return standing(join([stand, fin]))
+    return standing(join([stand, placed(ridge, [0, -width / 2, high - 0.002])]))
