@@ -53,8 +53,8 @@ def _bag(rng: Generator) -> Mesh:
     """Return a filled bag, flat at its seams: a snack bag, pouch, sack or cushion."""
     half = np.array([log_uniform(rng, 0.04, 0.13), log_uniform(rng, 0.05, 0.16)])
     full = float(half.min()) * rng.uniform(0.25, 0.8)
-    points = np.asarray(ellipsoid([1.0, 1.0, 1.0]).vertices, np.float64)
     mesh = ellipsoid([1.0, 1.0, 1.0])
+    points = np.asarray(mesh.vertices, np.float64)
     flat = np.linalg.norm(points[:, :2], axis=1, keepdims=True) + 1e-9
     square = rng.uniform(3, 8)
     norm = (np.abs(points[:, :2]) ** square).sum(axis=1, keepdims=True) ** (1 / square) + 1e-9
