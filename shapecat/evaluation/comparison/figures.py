@@ -1,5 +1,6 @@
 """Counts over the frames of a comparison, and metrics computed from them."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -144,10 +145,7 @@ def _tracking(seen: Sequence[FrameIdentities], threshold: float) -> dict[str, An
     ``threshold`` is the lowest similarity of a matching pair, for MOTA and IDF1.
     """
     figures = compute_tracking_metrics(seen, threshold=threshold)._asdict()
-    return {
-        name: None if value != value else round(value, 4)  # noqa: PLR0124  NaN
-        for name, value in figures.items()
-    }
+    return {name: None if math.isnan(value) else round(value, 4) for name, value in figures.items()}
 
 
 def _mean(values: Sequence[float]) -> float | None:

@@ -75,17 +75,13 @@ def compute_tracking_metrics(
     occurrences = _occurrences(frames)
     hota, detection, association = _hota(occurrences)
     errors = counts["misses"] + counts["false_positives"] + counts["switches"]
-    objects = counts["objects"]
     return Identities(
         idf1=_idf1(occurrences, threshold),
-        mota=1 - errors / objects if objects else float("nan"),
+        mota=1 - errors / counts["objects"] if counts["objects"] else float("nan"),
         hota=hota,
         detection_accuracy=detection,
         association_accuracy=association,
-        switches=counts["switches"],
-        misses=counts["misses"],
-        false_positives=counts["false_positives"],
-        objects=objects,
+        **counts,
     )
 
 
@@ -95,7 +91,7 @@ def _clear_mot(frames: Iterable[FrameIdentities], threshold: float) -> Counter[s
     A pair stays matched while its similarity is at least ``threshold``.
     """
     last: dict[Hashable, Hashable] = {}
-    counts: Counter[str] = Counter()
+    counts = Counter(switches=0, misses=0, false_positives=0, objects=0)
     for frame in frames:
         true, found, similarity = frame
         pairs = _pairs(frame, np.asarray(similarity) >= threshold, last)
