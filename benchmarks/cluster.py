@@ -80,12 +80,10 @@ class Queue:
         return self.free
 
 
-def simulate(
-    workers: int, costs: Measured, given: Assumed, *, written_mb: float | None = None
-) -> dict[str, float]:
+def simulate(workers: int, costs: Measured, given: Assumed) -> dict[str, float]:
     """Return the hours, the efficiency, and the utilization of each shared resource.
 
-    All but the hours are fractions. ``written_mb``, per frame, replaces that of ``given``.
+    All but the hours are fractions.
 
     Recordings are sent out largest first. Each one queues for the scheduler, for reading from the
     storage, for its worker's core, for writing to the storage, and for the manifest.
@@ -93,7 +91,6 @@ def simulate(
     rng = np.random.default_rng(0)
     frames = rng.lognormal(math.log(given.median_frames), given.spread, given.recordings)
     crowded = max(1.0, workers / given.cores) if given.cores else 1.0
-    written = given.written_mb if written_mb is None else written_mb
     scheduler, storage, manifest = Queue(), Queue(), Queue()
     planned = costs.plan_s * given.recordings
     todo = iter(np.sort(frames)[::-1].tolist())
@@ -115,8 +112,8 @@ def simulate(
             after, state = now + crowded * spent, "write"
             compute += spent
         elif state == "write":
-            alone = n * written / given.stream_mb_s
-            after = max(storage.serve(now, n * written / given.storage_mb_s), now + alone)
+            alone = n * given.written_mb / given.stream_mb_s
+            after = max(storage.serve(now, n * given.written_mb / given.storage_mb_s), now + alone)
             state = "note"
         else:
             after, state = manifest.serve(now, LINES * costs.line_s), "idle"
@@ -312,15 +309,13 @@ def main(
 
 def study(given: Assumed, frame_s: float, plot: Path) -> None:
     """Simulate the cluster, print tables, draw a plot."""
-    wide = replace(given, storage_mb_s=10 * given.storage_mb_s)
     costs = measure(frame_s)
-    results = {
-        "all outputs, 10 Gbit/s": [simulate(n, costs, given) for n in WORKERS],
-        "all outputs, 100 Gbit/s": [simulate(n, costs, wide) for n in WORKERS],
-        "tables alone, 10 Gbit/s": [
-            simulate(n, costs, given, written_mb=given.tables_mb) for n in WORKERS
-        ],
+    cases = {
+        "all outputs, 10 Gbit/s": given,
+        "all outputs, 100 Gbit/s": replace(given, storage_mb_s=10 * given.storage_mb_s),
+        "tables alone, 10 Gbit/s": replace(given, written_mb=given.tables_mb),
     }
+    results = {name: [simulate(n, costs, case) for n in WORKERS] for name, case in cases.items()}
     for title, rows in results.items():
         shown = [
             (f"{n}", f"{r['hours']:.1f}", *(f"{100 * r[key]:.1f}" for key in tuple(r)[1:]))
