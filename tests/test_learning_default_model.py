@@ -72,9 +72,12 @@ def test_default_model_is_small_and_has_its_card() -> None:
 def test_model_card_matches_its_template(tmp_path: Path) -> None:
     """A caveat that is in the card but not in its template is lost with the next training."""
     card = (files("shapecat.models") / "MODEL_CARD.md").read_text("utf-8")
-    report: Any = SimpleNamespace(categories=CATEGORIES, confusion=np.zeros((7, 7), int).tolist())
-    write_card(tmp_path / "card.md", model=load_model().model_id, categories=CATEGORIES,
-               tables=(), confusion=report, settings={})  # fmt: skip
+    report: Any = SimpleNamespace(
+        model=load_model().model_id,
+        categories=CATEGORIES,
+        confusion=np.zeros((7, 7), int).tolist(),
+    )
+    write_card(tmp_path / "card.md", tables=(), confusion=report, settings={})
     text, end = (tmp_path / "card.md").read_text("utf-8"), "\n## Confusion on clear views"
 
     assert card.startswith(text[: text.index(end)])

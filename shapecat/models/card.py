@@ -71,24 +71,18 @@ def format_table(table: Table) -> str:
 
 
 def write_card(
-    path: Path,
-    *,
-    model: str,
-    categories: Sequence[str],
-    tables: Sequence[Table],
-    confusion: Report,
-    settings: Mapping[str, object],
+    path: Path, *, tables: Sequence[Table], confusion: Report, settings: Mapping[str, object]
 ) -> None:
     """Write the model card.
 
     Parameters
     ----------
-    model : id of the model.
     tables : results to print.
-    confusion : report whose confusion matrix is printed.
+    confusion : report on the model, whose confusion matrix is printed.
     settings : settings of the training, by name.
     """
-    head = _HEAD.format(model=model, categories=", ".join(categories), picture=PICTURE)
+    categories = ", ".join(confusion.categories)
+    head = _HEAD.format(model=confusion.model, categories=categories, picture=PICTURE)
     confusion_table = Table(
         "Confusion on clear views of the test set (true category in rows)",
         ("", *confusion.categories),

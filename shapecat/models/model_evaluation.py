@@ -86,8 +86,6 @@ def evaluate_model(
     clear = evaluate(sets["test"].where(clear_views(sets["test"])).views, model)
     write_card(
         out / "MODEL_CARD.md",
-        model=model.model_id,
-        categories=model.categories,
         tables=tables,
         confusion=clear,
         settings={
