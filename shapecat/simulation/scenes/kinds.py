@@ -141,8 +141,7 @@ def _turntable(rng: Generator, spec: _SceneSpec) -> World:
     for category in spec.draw(rng, int(rng.integers(5, 9))):
         layout.put(category, table, np.array([0.3, 0.3]), attempts=4)
     target = np.array([0, 0, table.height + 0.04])
-    distance, elevation = rng.uniform(0.9, 1.2), rng.uniform(28, 48)
-    path = static_view(rng, target, spec.filming.frames, distance=distance, elevation=elevation)
+    path = static_view(rng, target, spec.filming.frames)
     speed = rng.choice([-1, 1]) * rng.uniform(0.25, 0.5)  # radians per second
     turns = np.round(speed * spec.filming.times(), 9)
     return World("turntable", (*room, table), tuple(layout.objects), path, turns)

@@ -112,18 +112,11 @@ def lateral_pass(rng: Generator, target: F8, filming: Filming) -> tuple[Pose, ..
     return tuple(looking_at(e, g, roll=float(r)) for e, g, r in zip(eye, aim, roll, strict=True))
 
 
-def static_view(
-    rng: Generator, target: F8, frames: int, *, distance: float, elevation: float
-) -> tuple[Pose, ...]:
-    """Return the poses of a static camera that faces a target: the same one for all frames.
+def static_view(rng: Generator, target: F8, frames: int) -> tuple[Pose, ...]:
+    """Return the pose of a static camera that faces a target, once for each of the frames.
 
-    Parameters
-    ----------
-    target : (3,) metres, world frame; the camera is on the side of negative y.
-    frames : number of poses.
-    distance : distance to the target, metres.
-    elevation : angle of the line of sight below the horizontal, degrees.
+    ``target`` (3,) is in metres, world frame; the camera is on the side of negative y.
     """
-    up = np.radians(elevation)
+    distance, up = rng.uniform(0.9, 1.2), np.radians(rng.uniform(28, 48))
     eye = target + distance * np.array([0, -np.cos(up), np.sin(up)])
     return (looking_at(eye, target, roll=float(np.radians(rng.normal(0, 1.0)))),) * frames
