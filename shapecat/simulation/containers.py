@@ -15,7 +15,7 @@ from shapecat.simulation.messages import MessageFactory
 __all__ = ["CONTAINERS", "Container", "Format", "FormatName"]
 
 _STATIC = "/tf_static"
-_QOS = """- history: {history}
+_QOS = """- history: 1
   depth: {depth}
   reliability: 1
   durability: {durability}
@@ -56,7 +56,7 @@ class _Mcap:
         text, _ = self.messages.typestore.generate_msgdef(name, ros_version=2)
         schema = self._file.register_schema(name, "ros2msg", text.encode())
         latched = topic == _STATIC
-        qos = _QOS.format(history=1, depth=1 if latched else 10, durability=1 if latched else 2)
+        qos = _QOS.format(depth=1 if latched else 10, durability=1 if latched else 2)
         return int(self._file.register_channel(topic, "cdr", schema, {"offered_qos_profiles": qos}))
 
 
