@@ -39,7 +39,7 @@ class ScoredObject(NamedTuple):
 
 
 def evaluate(
-    kind: str, sensor: str, first: int, count: int, model: Categorizer, settings: Settings
+    kind: str, sensor: str, first: int, count: int, model: Categorizer
 ) -> tuple[list[ScoredObject], Overlap]:
     """Perceive one frame of each scene; return the found objects, and the overlap of all masks."""
     found: list[ScoredObject] = []
@@ -49,7 +49,7 @@ def evaluate(
         names = np.where(rng.random(OBJECTS) < UNKNOWN, "unknown", rng.choice(CATEGORIES, OBJECTS))
         world = SCENES[kind](rng, names.tolist(), Filming(1, 30.0))
         frame, labels = render_frame(world, 0, rng=rng, sensor=PRESETS[sensor])
-        seen = perceive(frame, up=None, categorizer=model, settings=settings).detections
+        seen = perceive(frame, up=None, categorizer=model, settings=Settings()).detections
         flat = labels.reshape(-1)
         masks = [(item, np.flatnonzero(flat == item.label)) for item in world.objects]
         masks = [(item, mask) for item, mask in masks if len(mask) >= SEEN_PIXELS]
@@ -126,11 +126,10 @@ def main(
     first: int, count: int, kinds: tuple[str, ...], sensors: tuple[str, ...], model: Path | None
 ) -> None:
     """Evaluate piles, bins and compartments, and print a table."""
-    categorizer, settings = load_model(model), Settings()
-    rows = []
+    categorizer, rows = load_model(model), []
     for kind in kinds or SCENES:
         for sensor in PRESETS if "all" in sensors else sensors:
-            scored = evaluate(kind, sensor, first, count, categorizer, settings)
+            scored = evaluate(kind, sensor, first, count, categorizer)
             found = figures(*scored, categorizer)
             cells = (f"{v:.3f}" if v % 1 else f"{v:g}" for v in found.values())
             rows.append((f"{kind}, {sensor}", *cells))

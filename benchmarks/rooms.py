@@ -56,10 +56,10 @@ class Counts(NamedTuple):
         return (name, self.frames, self.detections, surplus, self.pieces, found, share)
 
 
-def evaluate(sensor: str, seed: int, model: Categorizer, settings: Settings) -> Counts:
+def evaluate(sensor: str, seed: int, model: Categorizer) -> Counts:
     """Perceive a frame of a room and count its detections."""
     _, frame, labels = simulated_frame("room", seed, PRESETS[sensor])
-    seen = perceive(frame, up=None, categorizer=model, settings=settings).detections
+    seen = perceive(frame, up=None, categorizer=model, settings=Settings()).detections
     return count([d.candidate.indices for d in seen], labels)
 
 
@@ -86,11 +86,11 @@ def count(detections: list[Array], labels: Array) -> Counts:
 )
 def main(first: int, rooms: int, model: Path | None) -> None:
     """Count surplus detections in rooms, and print a table."""
-    categorizer, settings = load_model(model), Settings()
+    categorizer = load_model(model)
     found = dict.fromkeys(PRESETS, Counts())
     for k in range(rooms):
         name = list(PRESETS)[k % len(PRESETS)]
-        found[name] += evaluate(name, first + k, categorizer, settings)
+        found[name] += evaluate(name, first + k, categorizer)
     rows = [counts.row(name) for name, counts in found.items() if counts.frames]
     click.echo(markdown("Rooms", HEAD, [*rows, sum(found.values(), Counts()).row("all")]))
 

@@ -7,7 +7,7 @@ from benchmarks.piles import evaluate
 from benchmarks.planes import keeps_table, view_of
 from benchmarks.simulated import score
 from shapecat.arrays import freeze
-from shapecat.config import DetectionSettings, Settings
+from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
 from shapecat.detection.planes import find_supporting_planes
@@ -243,7 +243,7 @@ def test_objects_are_found_on_hardly_visible_boards(seeds: tuple[int, ...]) -> N
     """Without the plane of a board, all objects on it are lost."""
     found = total = 0
     for seed in seeds:
-        _, overlap = evaluate("shelf bin", "kinect", seed, 1, load_model(None), Settings())
+        _, overlap = evaluate("shelf bin", "kinect", seed, 1, load_model(None))
         found += overlap.hits
         total += overlap.objects
     assert total > 6 * len(seeds)
