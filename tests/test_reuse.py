@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import shapecat.pipeline
+from shapecat.arrays import F8
 from shapecat.config import Settings
 from shapecat.errors import ConfigError
 from shapecat.geometry import IDENTITY, compose, transform
@@ -21,7 +22,7 @@ from shapecat.reuse.views import KeyView, _similar, find_repeats, reused, view_o
 from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.recorder import record
-from shapecat.simulation.scenes.worlds import Motion, World
+from shapecat.simulation.scenes.worlds import World
 from shapecat.types import Box, Candidate, Detection, Frame, FullBox, NeuralGas, Perception, Pose
 from tests.conftest import Guesser
 from tests.frame_detections import FrameDetections, gather
@@ -40,9 +41,9 @@ def still_world(frames: int = FRAMES, **changes: Any) -> World:
     return replace(table(), path=table().path * frames, turns=np.zeros(frames), **changes)
 
 
-def shifted(track: int, shifts: Sequence[Any]) -> Motion:
+def shifted(track: int, shifts: Sequence[Any]) -> dict[int, F8]:
     """Return a motion by a shift (3,) per frame; None where the object is absent."""
-    return Motion(track, np.array([(np.nan,) * 3 if s is None else s for s in shifts]))
+    return {track: np.array([(np.nan,) * 3 if s is None else s for s in shifts])}
 
 
 def alone(world: World) -> int:
@@ -122,7 +123,7 @@ def test_only_moved_object_is_described_again() -> None:
     place = world.objects[track].pose.translation
     shift = np.array([*(0.05 * place[:2] / np.linalg.norm(place[:2])), 0])
     motion = shifted(track, [(0, 0, 0)] * CHANGE + [shift] * (FRAMES - CHANGE))
-    world = replace(world, motions=(motion,))
+    world = replace(world, motions=motion)
 
     perceptions = perceive(world)
 
@@ -148,10 +149,10 @@ def test_another_object_at_same_place_is_described_again() -> None:
     bottom = [item.mesh.vertices[:, 2].min() for item in world.objects]
     across = place - world.objects[other].pose.translation
     across[2] += bottom[track] - bottom[other]
-    motions = (
-        shifted(track, [(0, 0, 0)] * CHANGE + [None] * (FRAMES - CHANGE)),
-        shifted(other, [None] * CHANGE + [across] * (FRAMES - CHANGE)),
-    )
+    motions = {
+        **shifted(track, [(0, 0, 0)] * CHANGE + [None] * (FRAMES - CHANGE)),
+        **shifted(other, [None] * CHANGE + [across] * (FRAMES - CHANGE)),
+    }
 
     perceptions = perceive(replace(world, motions=motions))
 
@@ -169,7 +170,7 @@ def test_partly_hidden_object_is_described_again() -> None:
     shift = between - world.objects[blocker].pose.translation
     motion = shifted(blocker, [None] * CHANGE + [shift] * (FRAMES - CHANGE))
 
-    perceptions = perceive(replace(world, motions=(motion,)))
+    perceptions = perceive(replace(world, motions=motion))
 
     near = [
         d.reused_from
@@ -190,7 +191,7 @@ def test_slowly_moving_object_is_described_again() -> None:
     way = step * place[:2] / np.linalg.norm(place[:2])
     motion = shifted(track, [(*(k * way), 0) for k in range(frames)])
 
-    perceptions = perceive(replace(world, motions=(motion,)))
+    perceptions = perceive(replace(world, motions=motion))
 
     origins = []
     for k in range(frames):

@@ -10,7 +10,7 @@ from shapecat.arrays import F8
 from shapecat.simulation.scenes.furniture import make_counter, make_room, make_table
 from shapecat.simulation.scenes.layout import Layout
 from shapecat.simulation.scenes.paths import Filming, arc_orbit, lateral_pass
-from shapecat.simulation.scenes.worlds import Motion, Support, World
+from shapecat.simulation.scenes.worlds import Support, World
 from shapecat.types import Pose
 
 __all__ = ["crossing", "rearranged", "walking"]
@@ -47,7 +47,7 @@ def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> Wor
     room, table = make_room(rng, wall_chance=0.3), make_table(rng, (1.3, 0.85))
     layout = Layout(rng, gap=0.02, enclosed=True)
     t = filming.times()
-    motions = []
+    motions = {}
     for side, low in ((1.0, -0.13), (-1.0, 0.01)):
         lane = _strip(table, (-0.45, 0.45), (low, low + 0.12))
         if not layout.put(str(rng.choice(_MOVERS)), lane, _ANYWHERE, attempts=40):
@@ -56,13 +56,13 @@ def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> Wor
         amplitude, speed = rng.uniform(0.3, 0.4), side * rng.uniform(0.14, 0.25)
         phase = np.arcsin(np.clip(x / amplitude, -1, 1))
         along = amplitude * np.sin(speed / amplitude * t + phase) - amplitude * np.sin(phase)
-        motions.append(_shifted(len(layout.objects) - 1, along))
+        motions[len(layout.objects) - 1] = _shifted(along)
     rows = [_strip(table, (-0.5, 0.5), y) for y in ((-0.32, -0.15), (0.15, 0.37))]
     for k, category in enumerate(categories):
         layout.put(category, rows[k % 2], _ANYWHERE, attempts=20)
     path = _orbit_table(rng, table, filming, elevation=(25, 40), sweep=8)
     objects = tuple(layout.objects)
-    return World("crossing", (*room, table), objects, path, motions=tuple(motions))
+    return World("crossing", (*room, table), objects, path, motions=motions)
 
 
 def rearranged(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
@@ -81,19 +81,19 @@ def rearranged(rng: Generator, categories: Sequence[str], filming: Filming) -> W
     duration, t = filming.frames / filming.rate_hz, filming.times()
     starts = rng.uniform([0.15, 0.15, 0.5, 0.15], [0.5, 0.5, 0.8, 0.5])
     pushed, carried, removed, added = starts * duration
-    motions = [_pushed(0, layout.objects[0].pose.translation, t - pushed)]
+    motions = {0: _pushed(layout.objects[0].pose.translation, t - pushed)}
     for k in range(1, len(layout.objects)):
         goal = layout.reserve_position(k, back, _ANYWHERE)
         if goal is not None:
-            motions.append(_carried(k, goal - layout.objects[k].pose.translation, t - carried))
+            motions[k] = _carried(goal - layout.objects[k].pose.translation, t - carried)
             break
-    others = [k for k in range(1, len(layout.objects)) if k != motions[-1].track]
+    others = [k for k in range(1, len(layout.objects)) if k not in motions]
     there = t[:, None] < removed, t[:, None] >= added
     for k, when in zip(others, there, strict=False):
-        motions.append(Motion(k, np.where(when, np.zeros(3), np.nan)))
+        motions[k] = np.where(when, np.zeros(3), np.nan)
     path = _orbit_table(rng, table, filming, elevation=(30, 48), sweep=12)
     objects = tuple(layout.objects)
-    return World("rearranged", (*room, table), objects, path, motions=tuple(motions))
+    return World("rearranged", (*room, table), objects, path, motions=motions)
 
 
 def _orbit_table(
@@ -118,26 +118,26 @@ def _strip(support: Support, x: tuple[float, float], y: tuple[float, float]) -> 
     return replace(support, outline=np.column_stack([corners, np.full(4, support.height)]))
 
 
-def _shifted(track: int, along: F8) -> Motion:
-    """Return the motion of an object in x; ``along`` (frames,) are its displacements, metres."""
-    return Motion(track, np.round(np.outer(along, [1.0, 0, 0]), 6))
+def _shifted(along: F8) -> F8:
+    """Return a motion in x, as in `World`; ``along`` (frames,) are displacements, metres."""
+    return np.round(np.outer(along, [1.0, 0, 0]), 6)
 
 
-def _pushed(track: int, start: F8, t: F8) -> Motion:
+def _pushed(start: F8, t: F8) -> F8:
     """Return the motion of an object that is pushed 0.4 m along x, at 0.2 m/s, from t = 0.
 
     ``start`` (3,) is its position, from which it moves towards x = 0; ``t`` (frames,) is the time
     of each frame, seconds.
     """
     distance = -np.sign(start[0] or 1.0) * 0.4
-    return _shifted(track, distance * np.clip(t * 0.2 / abs(distance), 0, 1))
+    return _shifted(distance * np.clip(t * 0.2 / abs(distance), 0, 1))
 
 
-def _carried(track: int, displacement: F8, t: F8) -> Motion:
+def _carried(displacement: F8, t: F8) -> F8:
     """Return the motion of an object that is carried by ``displacement`` (3,), metres.
 
     It moves at 0.5 m/s from t = 0, and is lifted by up to 15 cm; ``t`` is as for `_pushed`.
     """
     share = np.clip(t * 0.5 / max(float(np.linalg.norm(displacement)), 0.1), 0, 1)
     height = 0.6 * share * (1 - share)
-    return Motion(track, np.round(np.outer(share, displacement) + np.outer(height, [0, 0, 1.0]), 6))
+    return np.round(np.outer(share, displacement) + np.outer(height, [0, 0, 1.0]), 6)

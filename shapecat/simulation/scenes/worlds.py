@@ -1,5 +1,7 @@
 """Simulated worlds: supports, objects, their motions, and a camera path."""
 
+from collections.abc import Mapping
+from dataclasses import field
 from functools import cached_property, partial
 
 import numpy as np
@@ -11,7 +13,7 @@ from shapecat.simulation.camera.render import Geometry, geometry
 from shapecat.simulation.shapes.mesh import Mesh
 from shapecat.types import Pose
 
-__all__ = ["FIRST_OBJECT_LABEL", "Motion", "PlacedObject", "Support", "World", "pose_from_yaw"]
+__all__ = ["FIRST_OBJECT_LABEL", "PlacedObject", "Support", "World", "pose_from_yaw"]
 
 FIRST_OBJECT_LABEL = 20
 """Pixel label of the object with track 0; supports have 1 to 9, pixels without depth 0."""
@@ -85,20 +87,6 @@ class PlacedObject(Record):
         return self.category == "cup" and self.upside_down and not _one_sided(self.mesh)
 
 
-class Motion(Record):
-    """The motion of one object, its appearance and disappearance.
-
-    Attributes
-    ----------
-    track : track of the object.
-    shifts : (t, 3) translation from its start pose in each frame, metres, world frame; NaN in
-        frames where the object is absent.
-    """
-
-    track: int
-    shifts: F8 = array("t 3", "f8")
-
-
 class World(Record):
     """A scene over time; the world frame is fixed, with z up and the floor at z = 0.
 
@@ -109,7 +97,8 @@ class World(Record):
     path : ``world_from_camera`` for each of the t images, with the camera's optical axes.
     turns : (t,) rotation of all objects about the world's z axis in each frame, radians; None if
         they do not rotate.
-    motions : motions of individual objects.
+    motions : for each track of an object that moves, comes or goes, its translation (t, 3) from its
+        start pose in each frame, metres, world frame; NaN in frames where the object is absent.
     """
 
     kind: str
@@ -117,7 +106,7 @@ class World(Record):
     objects: tuple[PlacedObject, ...]
     path: tuple[Pose, ...]
     turns: F8 | None = array("t", "f8", default=None)
-    motions: tuple[Motion, ...] = ()
+    motions: Mapping[int, F8] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -126,15 +115,15 @@ class World(Record):
     def pose_of(self, item: PlacedObject, frame: int) -> Pose:
         """Return ``world_from_mesh`` of an object in a frame; an absent object is not shifted."""
         pose = item.pose
-        if item.track in self._shifts and self.present(item, frame):
-            pose = Pose(pose.rotation, pose.translation + self._shifts[item.track][frame])
+        if item.track in self.motions and self.present(item, frame):
+            pose = Pose(pose.rotation, pose.translation + self.motions[item.track][frame])
         turn = 0.0 if self.turns is None else float(self.turns[frame])
         return compose(pose_from_yaw(turn), pose) if turn else pose
 
     def present(self, item: PlacedObject, frame: int) -> bool:
         """Return whether an object is present in a frame."""
-        shift = self._shifts.get(item.track)
-        return shift is None or bool(np.isfinite(shift[frame]).all())
+        shifts = self.motions.get(item.track)
+        return shifts is None or bool(np.isfinite(shifts[frame]).all())
 
     def geometry(self, frame: int) -> Geometry:
         """Return the triangles in a frame, in world coordinates: supports first, then objects."""
@@ -150,11 +139,6 @@ class World(Record):
         """(n + 1,) labels of the supports, then of the objects; the last one, 0, is for no mesh."""
         labels = [s.label for s in self.supports] + [t.label for t in self.objects]
         return np.array([*labels, 0], np.uint8)
-
-    @cached_property
-    def _shifts(self) -> dict[int, F8]:
-        """The displacements (frames, 3) of each moving object, metres, by track."""
-        return {motion.track: motion.shifts for motion in self.motions}
 
     @cached_property
     def _still(self) -> Geometry:
