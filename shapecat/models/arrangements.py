@@ -15,7 +15,7 @@ from shapecat.simulation.shapes.categories import make_object
 from shapecat.simulation.shapes.distractors import make_distractor
 from shapecat.simulation.shapes.mesh import Mesh, moved, scaled, standing
 from shapecat.simulation.shapes.primitives import rounded_box
-from shapecat.simulation.shapes.stable_poses import choose_stable_pose, stable_poses
+from shapecat.simulation.shapes.stable_poses import choose_stable_pose
 from shapecat.types import CATEGORIES, UNKNOWN, Pose
 
 __all__ = ["BARE_TABLE", "ArrangedObject", "Arrangement", "ArrangementOptions", "arrange", "placed"]
@@ -181,7 +181,7 @@ def _at_rest(
     resting_pose = str(rng.choice(list(chances), p=list(chances.values())))
     stable = None
     if resting_pose != "upright":
-        stable = choose_stable_pose(stable_poses(mesh), resting_pose, rng)
+        stable = choose_stable_pose(mesh, resting_pose, rng)
     if stable is None:
         return ArrangedObject(standing(mesh), label, "upright", 0.0)
     return ArrangedObject(moved(mesh, stable.pose), label, resting_pose, 0.0)

@@ -12,7 +12,7 @@ from shapecat.simulation.scenes.worlds import PlacedObject, Support, pose_from_y
 from shapecat.simulation.shapes.categories import make_object
 from shapecat.simulation.shapes.distractors import make_distractor
 from shapecat.simulation.shapes.mesh import Mesh
-from shapecat.simulation.shapes.stable_poses import StablePose, choose_stable_pose, stable_poses
+from shapecat.simulation.shapes.stable_poses import StablePose, choose_stable_pose
 from shapecat.types import UNKNOWN, Pose
 
 __all__ = ["SUPPORTING", "Layout", "Piece", "make_piece", "place_piece"]
@@ -58,7 +58,7 @@ def make_piece(category: str, rng: Generator) -> Piece:
     pose_name = _draw_resting_pose(category, rng)
     stable_pose = StablePose(IDENTITY, "upright")
     if pose_name != "upright" and category not in {"ball", UNKNOWN}:
-        stable_pose = choose_stable_pose(stable_poses(mesh), pose_name, rng) or stable_pose
+        stable_pose = choose_stable_pose(mesh, pose_name, rng) or stable_pose
     return Piece(category, kind, mesh, stable_pose)
 
 

@@ -58,11 +58,9 @@ def stable_poses(mesh: Mesh) -> tuple[StablePose, ...]:
     return tuple(poses)
 
 
-def choose_stable_pose(
-    poses: tuple[StablePose, ...], name: str, rng: Generator
-) -> StablePose | None:
-    """Draw a random stable pose with this name; None if there is none."""
-    fitting = [stable for stable in poses if stable.name == name]
+def choose_stable_pose(mesh: Mesh, name: str, rng: Generator) -> StablePose | None:
+    """Draw a random stable pose of a mesh with this name; None if there is none."""
+    fitting = [stable for stable in stable_poses(mesh) if stable.name == name]
     return fitting[int(rng.integers(len(fitting)))] if fitting else None
 
 
