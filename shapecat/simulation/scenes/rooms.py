@@ -1,6 +1,6 @@
 """Rooms: a table with objects among robot arms, people, screens, chairs, walls and curtains."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.random import Generator
@@ -42,7 +42,9 @@ def room(
     standing = [*_arms(rng, table), *_screens(rng, table)]
     around = [*_surroundings(rng), *_cables(rng, table)]
     drops, items = [], [make_item(category, rng, kinds) for category in categories]
-    items += [Item(UNKNOWN, name, make(rng)) for name, make in _devices(rng)]
+    items += [
+        Item(UNKNOWN, name, make(rng)) for name, make in _DEVICES.items() if rng.random() < 0.35
+    ]
     half = np.ptp(table.outline[:, :2], axis=0) / 2
     for item in items:
         margin = float(item.mesh.extents[:2].max()) / 2
@@ -55,12 +57,6 @@ def room(
     other_supports = [s for s in supports if s is not table]
     everything = (*other_supports, *solid, *as_equipment("room", around))
     return World("room", everything, objects, path)
-
-
-def _devices(rng: Generator) -> Iterator[tuple[str, Callable[[Generator], Mesh]]]:
-    for name, make in _DEVICES.items():
-        if rng.random() < 0.35:
-            yield name, make
 
 
 def _walls(rng: Generator) -> Iterator[Support]:
