@@ -10,7 +10,7 @@ from zlib import crc32
 
 import numpy as np
 
-from shapecat.arrays import F4, F8
+from shapecat.arrays import F4
 from shapecat.config import Settings
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.detection import detect
@@ -91,9 +91,8 @@ class SimulatedView(NamedTuple):
 
 
 class _Conditions(NamedTuple):
-    """Label and conditions of an object or of background; fields as in `SimulatedView`."""
+    """Conditions of a view of an object or of background; fields as in `SimulatedView`."""
 
-    label: str
     resting_pose: str
     sensor: str
     visible: float
@@ -205,9 +204,7 @@ def _views_of(
         view, overlap = remove_base(_segment_by_truth(image, k, item, rng), rng), 1.0
         source = "truth"
     view = View(view.points, view.eye, item.label, instance)
-    conditions = _Conditions(
-        item.label, item.resting_pose, image.sensor, float(image.visible[k]), overlap
-    )
+    conditions = _Conditions(item.resting_pose, image.sensor, float(image.visible[k]), overlap)
     described = [_described(view, source, conditions)]
     if rng.random() < _FRAGMENTS:
         piece = cut_fragment(view, rng)
@@ -227,7 +224,7 @@ def _background(image: RenderedView, scene: Scene, objects: int, name: str) -> l
         ids = mesh_ids[candidate.indices]
         if np.mean((ids >= 0) & (ids < objects)) <= _BACKGROUND:
             view = replace(_view_of(image, scene, candidate), category=UNKNOWN, instance=name)
-            conditions = _Conditions(UNKNOWN, "upright", image.sensor, visible=1.0, overlap=1.0)
+            conditions = _Conditions("upright", image.sensor, visible=1.0, overlap=1.0)
             views.append(_described(view, "background", conditions))
     return [view for view in views if view is not None and view.descriptor[_HEIGHT] < _THIN_M]
 
@@ -263,16 +260,11 @@ def _segment_by_truth(
     camera_from_table = inverse(image.table_from_camera)
     up = camera_from_table.rotation[:, 2] + rng.normal(0, 0.008, 3)
     up /= np.linalg.norm(up)
-    foot = np.array([*_centre(item), item.support_m])
+    outline = item.mesh.vertices[:, :2]
+    foot = np.array([*(outline.min(axis=0) + outline.max(axis=0)) / 2, item.support_m])
     offset = float(up @ transform(camera_from_table, foot)) + rng.normal(0, 0.002)
     level = level_from_sensor(up, offset, points)
     return View(transform(level, points), level.translation, "", "")
-
-
-def _centre(item: ArrangedObject) -> F8:
-    """Return the horizontal middle (2,) of an object's mesh, metres."""
-    points = item.mesh.vertices[:, :2]
-    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
 def _described(view: View, source: str, conditions: _Conditions) -> SimulatedView | None:
@@ -285,6 +277,7 @@ def _described(view: View, source: str, conditions: _Conditions) -> SimulatedVie
         return None
     return SimulatedView(
         descriptor=described.descriptor,
+        label=view.category,
         instance=view.instance,
         points=described.points,
         distance=distance,
