@@ -28,13 +28,12 @@ def run(count: int) -> str:
         scene = detect(frame, settings=settings.detection, rng=np.random.default_rng(0))
         for candidate in scene.candidates[:4]:
             points, level = level_points(frame, scene, candidate)
-            upright = points.astype(np.float32)
+            upright, eye = points.astype(np.float32), level.translation
             cloud = voxelize(upright, voxel_m=settings.surface.voxel_m)
             gas = reconstruct(cloud, settings=settings.surface, rng=np.random.default_rng(0))
             if gas is None:
                 continue
-            row = describe(cloud, gas, eye=level.translation)[None]
-            eye = level.translation
+            row = describe(cloud, gas, eye=eye)[None]
             grow = partial(reconstruct, cloud, settings=settings.surface)
             works: dict[str, Callable[[], Any]] = {
                 "voxelize": partial(voxelize, upright, voxel_m=settings.surface.voxel_m),
@@ -45,7 +44,7 @@ def run(count: int) -> str:
             }
             for stage, work in works.items():
                 timed.setdefault(stage, []).append(cpu_ms(work))
-            objects.append((upright, level.translation))
+            objects.append((upright, eye))
     rows = [(stage, *summary(values).values()) for stage, values in timed.items()]
     gain = _speedup(objects, settings, model)
     columns = ("stage", "ms, median", "ms, p95", "ms, max")
@@ -71,17 +70,15 @@ def _speedup(objects: list[tuple[F4, F8]], settings: Settings, model: Categorize
 
     ``objects`` are the points (n, 3) and the eye (3,) of each.
     """
+    work = partial(_categorize, settings=settings, model=model)
+    points, eyes = zip(*objects * 4, strict=True)
     seconds = {}
     for threads in (1, 2):
         with ThreadPoolExecutor(threads) as pool:
             runs = []
             for _ in range(7):
                 begun = time.perf_counter()
-                list(
-                    pool.map(
-                        lambda item: _categorize(item[0], item[1], settings, model), objects * 4
-                    )
-                )
+                list(pool.map(work, points, eyes))
                 runs.append(time.perf_counter() - begun)
         seconds[threads] = min(runs)
     return round(seconds[1] / seconds[2], 2)
