@@ -1,6 +1,7 @@
 """The container formats of simulated recordings."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self, TypeAlias
 
@@ -61,18 +62,11 @@ class _Mcap:
 
 
 class _Bag:
-    """A ROS bag that rosbags writes; use it in a ``with`` block.
+    """A ROS 1 bag, or a ROS 2 bag: a folder with an SQLite database; use it in a ``with`` block."""
 
-    ``options`` is a function that returns the options of a connection. Its argument is whether the
-    topic is latched.
-    """
-
-    def __init__(
-        self, ros_version: int, writer: Any, options: Callable[[bool], dict[str, Any]]
-    ) -> None:
-        """Write messages of this version of ROS with ``writer``, a writer of rosbags."""
+    def __init__(self, ros_version: int, path: Path) -> None:
         self.messages = MessageFactory(ros_version)
-        self._file, self._options = writer, options
+        self._file: Any = Ros1File(path) if ros_version == 1 else Ros2Folder(path, version=8)
         self._connections: dict[str, Any] = {}
 
     def __enter__(self) -> Self:
@@ -85,21 +79,13 @@ class _Bag:
     def write(self, topic: str, message: Any, log_time_ns: int) -> None:
         if topic not in self._connections:
             kind, store = message.__msgtype__, self.messages.typestore
-            options = self._options(topic == _STATIC)
+            latched = topic == _STATIC
+            options: dict[str, Any] = {"latching": int(latched)}
+            if self.messages.ros_version == 2:
+                options = {"offered_qos_profiles": [_qos(latched=latched)]}
             added = self._file.add_connection(topic, kind, typestore=store, **options)
             self._connections[topic] = added
         self._file.write(self._connections[topic], log_time_ns, self.messages.serialize(message))
-
-
-def _ros1(path: Path) -> _Bag:
-    """Return a new ROS 1 bag."""
-    return _Bag(1, Ros1File(path), lambda latched: {"latching": int(latched)})
-
-
-def _ros2(path: Path) -> _Bag:
-    """Return a new ROS 2 bag: a folder with an SQLite database."""
-    file = Ros2Folder(path, version=8)
-    return _Bag(2, file, lambda latched: {"offered_qos_profiles": [_qos(latched=latched)]})
 
 
 def _qos(*, latched: bool) -> ros.Qos:
@@ -131,7 +117,7 @@ class Format(NamedTuple):
 
 CONTAINERS: dict[str, Format] = {
     "mcap": Format(".mcap", _Mcap),
-    "ros1": Format(".bag", _ros1),
-    "ros2": Format("", _ros2),
+    "ros1": Format(".bag", partial(_Bag, 1)),
+    "ros2": Format("", partial(_Bag, 2)),
 }
 """The recording formats by name."""
