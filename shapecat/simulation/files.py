@@ -3,10 +3,9 @@
 import sqlite3
 import tempfile
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Self
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from shapecat.simulation.containers import CONTAINERS
 from shapecat.system.files import flush
 from shapecat.types import Camera
 
-__all__ = ["LabelFile", "completed", "require_replaceable", "written_paths"]
+__all__ = ["completed", "label_file", "require_replaceable", "written_paths"]
 
 
 def written_paths(out: Path, format: str) -> list[Path]:  # noqa: A002  the word users know
@@ -85,29 +84,24 @@ def _move(hidden_path: Path, path: Path) -> None:
     hidden_path.replace(path)
 
 
-class LabelFile:
-    """A compressed .npz file of pixel labels, written frame by frame in a ``with`` block.
+@contextmanager
+def label_file(path: Path, frames: int, camera: Camera) -> Iterator[Callable[[U1], None]]:
+    """Open a compressed .npz file of pixel labels; provide a function that adds those of a frame.
 
     Its only array is ``labels`` (frames, h, w), uint8.
     """
-
-    def __init__(self, path: Path, frames: int, camera: Camera) -> None:
-        self._archive = zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=4)
-        # ZipInfo's fixed date makes equal labels give equal bytes.
-        member = zipfile.ZipInfo("labels.npy")
-        member.compress_type = zipfile.ZIP_DEFLATED
-        self._file: IO[bytes] = self._archive.open(member, "w", force_zip64=True)
-        shape = (frames, camera.height, camera.width)
+    # ZipInfo's fixed date makes equal labels give equal bytes.
+    member = zipfile.ZipInfo("labels.npy")
+    member.compress_type = zipfile.ZIP_DEFLATED
+    shape = (frames, camera.height, camera.width)
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=4) as archive,
+        archive.open(member, "w", force_zip64=True) as file,
+    ):
         header = {"descr": "|u1", "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(self._file, header)
+        np.lib.format.write_array_header_1_0(file, header)
 
-    def __enter__(self) -> Self:
-        return self
+        def add(labels: U1) -> None:
+            file.write(np.ascontiguousarray(labels).tobytes())
 
-    def __exit__(self, *error: object) -> None:
-        self._file.close()
-        self._archive.close()
-
-    def append(self, labels: U1) -> None:
-        """Add the labels of the next frame."""
-        self._file.write(np.ascontiguousarray(labels).tobytes())
+        yield add

@@ -20,7 +20,7 @@ from shapecat.simulation.camera.presets import SENSORS
 from shapecat.simulation.camera.sensors import Sensor
 from shapecat.simulation.camera.views import render_frame
 from shapecat.simulation.containers import CONTAINERS, Container, FormatName
-from shapecat.simulation.files import LabelFile, completed, written_paths
+from shapecat.simulation.files import completed, label_file, written_paths
 from shapecat.simulation.scenes.kinds import SceneKind, make_scene
 from shapecat.simulation.scenes.worlds import World
 from shapecat.simulation.truth import frame_truth
@@ -133,8 +133,8 @@ def record(
         ExitStack() as stack,
     ):
         cameras = (sensor.camera, COLOUR_LENS.pinhole)
-        files = [
-            stack.enter_context(LabelFile(path, len(world), camera))
+        add_labels = [
+            stack.enter_context(label_file(path, len(world), camera))
             for path, camera in zip(labels, cameras, strict=False)
         ]
         for index in range(len(world)):
@@ -143,9 +143,9 @@ def record(
                 world, index, rng=rng, sensor=sensor, rate_hz=rate_hz, start_ns=EPOCH_NS
             )
             write_frame(writer, frame, world.path[index], clouds=clouds, color=color)
-            files[0].append(image)
+            add_labels[0](image)
             if color:
-                files[1].append(_write_colour(writer, world, frame))
+                add_labels[1](_write_colour(writer, world, frame))
             truths.append(
                 {
                     "frame": index,
