@@ -132,13 +132,8 @@ class World(Record):
 
     def labels_of(self, mesh_ids: I4) -> U1:
         """Return the pixel labels (h, w), uint8, of the visible meshes; 0 for the mesh id -1."""
-        return np.take(self._labels, mesh_ids, mode="wrap")
-
-    @cached_property
-    def _labels(self) -> U1:
-        """(n + 1,) labels of the supports, then of the objects; the last one, 0, is for no mesh."""
         labels = [s.label for s in self.supports] + [t.label for t in self.objects]
-        return np.array([*labels, 0], np.uint8)
+        return np.array([*labels, 0], np.uint8)[mesh_ids]
 
     @cached_property
     def _still(self) -> Geometry:
