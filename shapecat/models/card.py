@@ -2,11 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from shapecat.evaluation import Report
 
-__all__ = ["PICTURE", "Table", "format_table", "write_card"]
+__all__ = ["PICTURE", "markdown", "write_card"]
 
 PICTURE = "worst_mistakes.png"
 """File name of the picture beside the card."""
@@ -50,48 +49,30 @@ The views of the test set with the most confident wrong labels. Colour shows the
 """
 
 
-class Table(NamedTuple):
-    """A table of the card, with its title."""
-
-    title: str
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-
-def format_table(table: Table) -> str:
-    """Return a table in Markdown."""
-    lines = [
-        f"## {table.title}",
-        "",
-        "| " + " | ".join(table.head) + " |",
-        "|---" * len(table.head) + "|",
-        *("| " + " | ".join(row) + " |" for row in table.rows),
-    ]
-    return "\n".join(lines) + "\n"
+def markdown(title: str, head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return a table as Markdown, with a heading; ``head`` is its header."""
+    lines = [f"## {title}", "", f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
+    lines += [f"| {' | '.join(map(str, row))} |" for row in rows]
+    return "\n".join([*lines, ""])
 
 
 def write_card(
-    path: Path, *, tables: Sequence[Table], confusion: Report, settings: Mapping[str, object]
+    path: Path, *, tables: Sequence[str], confusion: Report, settings: Mapping[str, object]
 ) -> None:
     """Write the model card.
 
     Parameters
     ----------
-    tables : results to print.
+    tables : results, as Markdown.
     confusion : report on the model, whose confusion matrix is printed.
     settings : settings of the training, by name.
     """
     categories = ", ".join(confusion.categories)
     head = _HEAD.format(model=confusion.model, categories=categories, picture=PICTURE)
-    confusion_table = Table(
+    confusion_table = markdown(
         "Confusion on clear views of the test set (true category in rows)",
         ("", *confusion.categories),
-        [
-            (name, *map(str, row))
-            for name, row in zip(confusion.categories, confusion.confusion, strict=True)
-        ],
+        [(name, *row) for name, row in zip(confusion.categories, confusion.confusion, strict=True)],
     )
-    rows = [(name, str(value)) for name, value in settings.items()]
-    settings_table = Table("Settings", ("setting", "value"), rows)
-    parts = [head, *map(format_table, (*tables, confusion_table, settings_table))]
-    path.write_text("\n".join(parts), "utf-8")
+    settings_table = markdown("Settings", ("setting", "value"), list(settings.items()))
+    path.write_text("\n".join([head, *tables, confusion_table, settings_table]), "utf-8")

@@ -14,7 +14,7 @@ from shapecat.evaluation.markup import figure_text
 from shapecat.evaluation.views import describe_views
 from shapecat.learning import Categorizer
 from shapecat.models.arrangements import ArrangementOptions
-from shapecat.models.card import PICTURE, Table, format_table, write_card
+from shapecat.models.card import PICTURE, markdown, write_card
 from shapecat.models.meshes import mesh_views
 from shapecat.models.pictures import draw, worst_mistakes
 from shapecat.models.recorded import detected_views
@@ -79,8 +79,8 @@ def evaluate_model(
         views = describe_views(detected_views(folder), settings=Settings())
         rows.append(_figures(f"{folder.name}, as detected", evaluate(views, model)))
     tables = [
-        Table("Views", ("set", "views", "objects", "unknown"), _counts(sets)),
-        Table("Accuracy on unseen objects, single views", _HEAD, rows),
+        markdown("Views", ("set", "views", "objects", "unknown"), _counts(sets)),
+        markdown("Accuracy on unseen objects, single views", _HEAD, rows),
         _fused_table(tracks, model),
     ]
     clear = evaluate(sets["test"].where(clear_views(sets["test"])).views, model)
@@ -95,7 +95,7 @@ def evaluate_model(
         },
     )
     draw(out / PICTURE, worst_mistakes(_test_views(), model))
-    click.echo("\n".join(map(format_table, tables)))
+    click.echo("\n".join(tables))
     click.echo(format_report(clear))
 
 
@@ -146,13 +146,13 @@ def _figures(name: str, report: Report) -> tuple[str, ...]:
     return (name, str(report.n), *map(_text, values))
 
 
-def _counts(sets: dict[str, SimulatedViews]) -> list[tuple[str, ...]]:
+def _counts(sets: dict[str, SimulatedViews]) -> list[tuple[object, ...]]:
     return [
         (
             name,
-            str(len(views.views.labels)),
-            str(len(np.unique(views.views.instances))),
-            str(int(np.sum(views.views.labels == UNKNOWN))),
+            len(views.views.labels),
+            len(np.unique(views.views.instances)),
+            np.sum(views.views.labels == UNKNOWN),
         )
         for name, views in sets.items()
     ]
@@ -166,7 +166,7 @@ def _tracks(jobs: int) -> Iterable[SimulatedView]:
     return simulate_views(options, range(_TRACK_TABLES), jobs=jobs)
 
 
-def _fused_table(tracks: dict[str, SimulatedViews], model: Categorizer) -> Table:
+def _fused_table(tracks: dict[str, SimulatedViews], model: Categorizer) -> str:
     """Return a table of the accuracy after fusing several views of one placement of an object.
 
     ``tracks`` are the views, by the name of their data set.
@@ -174,11 +174,11 @@ def _fused_table(tracks: dict[str, SimulatedViews], model: Categorizer) -> Table
     rows = []
     for name, views in tracks.items():
         report = evaluate(views.where(clear_views(views)).views, model)
-        rows.append((name, "1", str(report.n), _text(report.accuracy), _text(report.ece)))
+        rows.append((name, 1, report.n, _text(report.accuracy), _text(report.ece)))
         rows += [
-            (name, str(item.views), str(item.groups), _text(item.accuracy), _text(item.ece))
+            (name, item.views, item.groups, _text(item.accuracy), _text(item.ece))
             for item in report.fused
         ]
     head = ("data", "views fused", "groups", "accuracy", "ECE")
     title = "Several fused views of one placement of an object, fused as in tracks"
-    return Table(title, head, rows)
+    return markdown(title, head, rows)
