@@ -1,6 +1,9 @@
 """Tests that the recordings in the folder fixtures give their expected tables."""
 
 import io
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -37,6 +40,28 @@ def test_fixture_gives_expected_tables(name: str, tmp_path: Path) -> None:
         for difference in differences(rows, read_table(expected_path(name, table)))
     ]
     assert wrong == [], f"{name} gives other tables; {RENEW}"
+
+
+def test_no_result_depends_on_freed_memory(tmp_path: Path) -> None:
+    """A kernel frees an array after its last use, even if a record taken from it is read later.
+
+    Most allocators leave freed memory as it was, so that nobody notices; this one overwrites it.
+    """
+    code = (
+        "from pathlib import Path; from tests.fixtures import *; "
+        f"tables = processed_tables(FIXTURES / 'clutter', Path({str(tmp_path / 'run')!r})); "
+        "print([*differences(tables['detections'], "
+        "read_table(expected_path('clutter', 'detections')))])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONMALLOC": "debug"},
+        cwd=Path(__file__).parents[1],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout == "[]\n"
 
 
 def test_comparison_ignores_rounding_differences() -> None:

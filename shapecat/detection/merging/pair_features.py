@@ -205,6 +205,7 @@ def write_pair_features(
     add_statistics(merged, 0, 1)
     relation.lateral_curvature = lateral_curvature(merged[0])
     relation.normal_position_correlation = normal_position_correlation(merged[0])
+    merged[1] = b  # numba frees the array after its last use, even if a record is read later
     relation.cells, relation.cell_m, relation.down = a.count, cell, view_geometry.up[2]
 
 
