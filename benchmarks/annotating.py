@@ -41,7 +41,7 @@ def again(folder: Path, recording: Path) -> None:
 
 def measure(folder: Path, frames: int, turns: int) -> tuple[Any, ...]:
     """Return frames, size (MB), median times to annotate and to copy (s), and their ratio."""
-    recording = write(folder / f"frames{frames}.mcap", tabletop(min(frames, 60))[0], frames)
+    recording = write(folder / f"frames{frames}.mcap", tabletop(min(frames, 60)), frames)
     run = folder / f"run{frames}"
     process(Job(recording, run, rrd=False))
     copy = ["cp", str(recording), str(folder / "copy")]

@@ -65,7 +65,7 @@ def ways() -> dict[str, Sequence[Sequence[str]]]:
 @click.option("--broken", default=4, help="How many of them are broken.")
 @click.option("--frames", default=60, help="Frames of each recording.")
 def main(*, recordings: int, broken: int, frames: int) -> None:
-    """Process a batch in every way and print a table."""
+    """Process a batch with each of the executors and print a table."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)

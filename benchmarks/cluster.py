@@ -202,7 +202,11 @@ def per_hour(costs: Measured, given: Assumed) -> list[tuple[str, ...]]:
 
 
 def check(folder: Path, *, recordings: int, frames: int) -> list[tuple[str, ...]]:
-    """Return rows: workers (1 to 4 on two cores), measured and modelled seconds, and error (%)."""
+    """Compare the model with runs on this machine; return a row for each of 1 to 4 workers.
+
+    A row has the number of workers, the measured and the modelled seconds, and the error of the
+    model (%), which assumes two cores. ``folder`` is an empty scratch folder.
+    """
     from tests.scenes import record  # noqa: PLC0415  the small scene of the tests
 
     (folder / "in").mkdir()

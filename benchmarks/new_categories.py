@@ -25,8 +25,9 @@ from shapecat.perception import perceive
 from shapecat.simulation import World, render_frame
 from shapecat.simulation.camera.presets import PRESETS
 from shapecat.simulation.scenes.furniture import make_table
-from shapecat.simulation.scenes.layout import Layout, Piece, make_piece
+from shapecat.simulation.scenes.layout import Layout, Piece
 from shapecat.simulation.scenes.paths import Filming, arc_orbit
+from shapecat.simulation.shapes.categories import make_object
 from shapecat.simulation.shapes.distractors import make_distractor
 from shapecat.simulation.shapes.stable_poses import StablePose
 from shapecat.types import CATEGORIES, UNKNOWN, Pose
@@ -38,6 +39,9 @@ LEARNED = 20
 RECORDED, TESTED, RATE_HZ = 8, 2, 1.0
 """Frames of the recording, frames of each other table, and the rate of both."""
 HALF_M = np.array([0.36, 0.26])
+"""Half the size of the area in which objects are placed, metres."""
+TRIES = 10
+"""Maximum number of calls that try to place an object."""
 UPRIGHT = StablePose(Pose(np.eye(3), np.zeros(3)), "upright")
 COLUMNS = (
     "new category", "views", "recognized", "old views", "right before", "right after",
@@ -137,10 +141,10 @@ def _see(kind: str, seed: Sequence[int], tables: int, frames: int, sensor: str) 
 def _table(kind: str, rng: np.random.Generator, frames: int) -> World:
     """Place three objects of a kind and one of each category, all upright, on a table."""
     table, layout = make_table(rng), Layout(rng, gap=0.03)
-    pieces = [Piece(kind, *make_distractor(rng, kind), UPRIGHT) for _ in range(OBJECTS)]
-    pieces += [make_piece(category, rng, resting_pose="upright") for category in CATEGORIES]
+    pieces = [Piece(kind, *make_distractor(rng, [kind]), UPRIGHT) for _ in range(OBJECTS)]
+    pieces += [Piece(name, name, make_object(name, rng), UPRIGHT) for name in CATEGORIES]
     for piece in pieces:
-        layout.put_piece(piece, table, HALF_M, tries=400)
+        any(layout.put_piece(piece, table, HALF_M) for _ in range(TRIES))
     path = arc_orbit(
         rng,
         np.array([0, 0, table.height + 0.05]),

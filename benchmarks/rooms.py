@@ -49,7 +49,7 @@ class Counts(NamedTuple):
         return Counts(*(a + b for a, b in zip(self, other, strict=True)))
 
     def row(self, name: str) -> tuple[Any, ...]:
-        """Return a row of the table."""
+        """Return the row of the table: the counts, the fraction found, and surplus per frame."""
         surplus = self.elsewhere + self.pieces
         found = f"{self.found / max(self.objects, 1):.3f}"
         share = f"{surplus / max(self.frames, 1):.2f}"

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 @click.option(
     "--out",
     type=ANY_PATH,
-    help="Folder to create, for a page with pictures, a table of all objects, and the metrics as "
-    "JSON.",
+    help="New folder for a page with pictures, a table of all objects, and the metrics as JSON.",
 )
 @recording_option
 @json_option

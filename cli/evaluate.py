@@ -32,7 +32,7 @@ def evaluate(
 
     Print accuracy, confusion matrix, calibration error, the AUROC of novelty detection, and the
     accuracy after fusing 3, 10 and 30 views of an instance. DATASET is laid out as for
-    `shapecat train`. The model must know every category of DATASET.
+    `shapecat train`. The model must know every category of DATASET except unknown.
 
     \b
     --baselines compares these classifiers with shapecat's own:

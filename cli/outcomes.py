@@ -109,7 +109,7 @@ def _row(job: "Job", summary: "Summary") -> tuple[Any, ...]:
 
 
 def _short_name(job: "Job") -> str:
-    """Return the name of the recording without folders and the query, which may have slashes."""
+    """Return the name of the recording without folders, and without the query of a URL."""
     from shapecat.batch.storage import names_in
 
     return names_in(job.origin)[1] if job.origin else job.source.name

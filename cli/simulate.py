@@ -66,7 +66,7 @@ def simulate(
 ) -> None:
     """Simulate a recording of objects, with ground truth beside it.
 
-    OUT is NAME.mcap, NAME.bag (ROS 1), or NAME for a ROS 2 folder. NAME.truth.json holds the
+    OUT is NAME.mcap, NAME.bag (ROS 1), or NAME for a ROS 2 bag. NAME.truth.json holds the
     objects of each frame, and NAME.labels.npz the object that each depth pixel shows. With --color,
     NAME.color_labels.npz holds the object that each colour pixel shows.
 

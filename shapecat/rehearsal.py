@@ -57,7 +57,10 @@ _TABLE_M = 0.4
 
 
 def find_ball() -> int:
-    """Detect a synthetic ball, plate and block; return how many objects match their own views."""
+    """Detect a synthetic ball, plate and block, which calls the kernels of detection and reuse.
+
+    Return the number of objects that are recognized again in the same frame.
+    """
     v, u = np.mgrid[:480, :640]
     rays = np.stack([(u - 320) / 525, (v - 240) / 525, np.ones(u.shape)], axis=-1)
     up = np.array([0, -np.sqrt(0.5), -np.sqrt(0.5)])

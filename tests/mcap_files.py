@@ -47,7 +47,7 @@ class McapChannels:
         return self._channels[topic, kind]
 
     def write(self, topic: str, kind: str, time: int, data: bytes) -> None:
-        """Write a message."""
+        """Write a message of type ``kind``; ``time``, ns, is its log time and its publish time."""
         self._writer.add_message(self.declare(topic, kind), time, data, time)
 
 

@@ -66,7 +66,7 @@ def test_samples_beyond_the_edge_of_a_plane_have_no_height() -> None:
 
 
 def test_far_sample_below_a_plane_by_noise_is_on_it() -> None:
-    """At 100 m noise is as large as 25 m: a placeholder must not be mistaken for such a height."""
+    """Far away, noise reaches many metres: a sample 15 m below a plane still is at its height."""
     extent = np.full(DIRECTIONS, 1000.0)
     plane = SupportingPlane(*_level_plane(40.0), UP, -40.0, extent, 1.0)
     inv_depth = np.zeros((240, 320), np.float32)

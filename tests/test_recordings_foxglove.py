@@ -197,7 +197,7 @@ def test_transforms_are_read(
     with open_recording(path) as recording:
         transforms = read_transforms(recording)
 
-    # Foxglove has no static transforms: each one is valid until the next.
+    # Foxglove has no static transforms: the last one stays valid.
     for stamp in (EPOCH, EPOCH + 60 * SECOND):
         pose = transforms.lookup("map", "camera", stamp)
         np.testing.assert_array_equal(pose.translation, [1, 2, 3])
@@ -206,7 +206,7 @@ def test_transforms_are_read(
 
 @pytest.mark.parametrize("beside_ros", [False, True])
 def test_transform_long_before_first_frame_is_known(tmp_path: Path, *, beside_ros: bool) -> None:
-    """Foxglove transforms hold until the next one; the last one before --start must be found.
+    """Foxglove transforms may be rare; the last one before --start must be found.
 
     The recording may also hold ROS transforms, which do not hold for so long.
     """

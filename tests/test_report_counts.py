@@ -46,7 +46,7 @@ def counted(run: Path) -> tuple[int, int, Counter[str]]:
 def test_page_and_index_count_the_labelled_tracks(
     run: Path, drawn: RunReport, labelled: dict[int, str]
 ) -> None:
-    """The page counted the tracks as they were before the corrections, the index those after."""
+    """Both must count them after the corrections: the page once counted them as before."""
     relabel(run, labelled)
     objects, unsure, categories = counted(run)
     page, index = Reports([replace(drawn, folder=run)], indexed=True).write()

@@ -483,8 +483,8 @@ def test_interleaved_sensors_each_reuse_their_own_frames() -> None:
             assert np.array_equal(again.posterior, described.posterior)
 
 
-def test_change_of_smallest_object_size_is_noticed() -> None:
-    """60 points are an object, which must not vanish in a repeated scene."""
+def test_change_as_small_as_smallest_object_is_noticed() -> None:
+    """60 points are an object: if 8 by 8 pixels change, the frame must not count as repeated."""
     frame = blank()
     assert frame.depth is not None
     for row, column in ((240, 320), (241, 323), (101, 77)):

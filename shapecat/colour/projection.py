@@ -75,7 +75,7 @@ def kernel_lens(lens: LensCamera) -> Lens:
 
 
 def rectified(pixels: U1, lens: LensCamera) -> U1:
-    """Return a colour image, ``pixels`` (h, w, 3) uint8, without the distortion of its lens.
+    """Undistort a colour image, ``pixels`` (h, w, 3) uint8.
 
     Colours are interpolated bilinearly. Pixels outside the original image are black.
 

@@ -66,11 +66,12 @@ def _find_bins(
 
 @kernel
 def distributions(surface: Surface, normals: F4, curvatures: F4, out: F4) -> None:
-    """Write the histograms over the whole object, its rings and its bands.
+    """Write histograms of curvature, normals and distances: whole object, rings and bands.
 
     Rings are intervals of the mean geodesic distance to the other neurons; bands are intervals of
-    height. ``normals`` (3, n) and ``curvatures`` (2, n) are from `fit_surfaces`; ``out`` is the
-    whole descriptor, of which the blocks ``curvature`` to ``band_curvature`` are written.
+    height. ``normals`` (3, k) and ``curvatures`` (2, k) of the k neurons are from `fit_surfaces`;
+    ``out`` is the whole descriptor, of which the blocks ``curvature`` to ``band_curvature`` are
+    written.
     """
     euclidean, geodesic, weight = surface.euclidean, surface.geodesic, surface.weight
     z = surface.neurons[2]

@@ -138,7 +138,7 @@ def _sampled(depth: F4, step: int, range_m: float) -> F4:
 
 @kernel(inner=True)
 def row_and_column(p: int, columns: int) -> tuple[int, int]:
-    """Return row and column of the cell with the flat index ``p``: ``row * columns + column``."""
+    """Return row and column of the cell with the flat index ``p`` = ``row * columns + column``."""
     i = int((p + 0.5) * (1.0 / columns))  # a multiplication is faster than a division
     return i, p - i * columns
 

@@ -183,10 +183,11 @@ class _NearSensor(NamedTuple):
 def _nearest_sensors(
     one: ColourStream, sensors: Sequence[Sequence[Stream]]
 ) -> dict[str, list[_NearSensor]]:
-    """Return the two sensors nearest to a colour topic, for each kind of depth stream.
+    """Return the two sensors whose topics share most of the namespace of a colour topic.
 
-    The nearest sensors share the most namespace components with it. Two are enough to compare any
-    sensor with the nearest other one.
+    They are listed for each kind of depth stream, ``depth`` and ``points``, the best first; the
+    second is needed when the best is compared with the others. ``sensors`` holds the streams of
+    each sensor.
     """
     nearest: dict[str, list[_NearSensor]] = {}
     for kind in ("depth", "points"):

@@ -18,7 +18,7 @@ _NEAR = 0.01
 _EQUAL = 1e-6
 """Intrinsics that differ by less than this fraction of the image width are equal."""
 _ALIGNED_PX = 2.0
-"""A lens is nearly aligned if it images the ray of each pixel less than this from the pixel."""
+"""With a nearly aligned lens, the ray of each pixel projects to less than this from the pixel."""
 _STEPS = 9
 """Rows and columns of the grid of pixels at which lens distortion is computed."""
 
@@ -34,9 +34,9 @@ def are_equal(lens: LensCamera, camera: Camera | None) -> bool:
 
 
 def is_nearly_aligned(lens: LensCamera, camera: Camera | None) -> bool:
-    """Return whether a lens images the ray of each pixel less than 2 pixels from that pixel.
+    """Return whether the ray of each pixel of a camera projects near that pixel through a lens.
 
-    The pixels are those of ``camera``. The result is True without a camera or without distortion.
+    Near is less than 2 pixels. The result is True without a camera or without distortion.
     """
     return _largest_offset_px(lens, camera) < _ALIGNED_PX
 

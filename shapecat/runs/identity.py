@@ -78,7 +78,7 @@ def unchanged(before: Sequence[Sequence[Any]], path: Path) -> bool:
 def content_digest(path: Path, *, cancelled: Event | None = None) -> str:
     """Return a digest of the whole content of a recording: a file, or the files of a bag.
 
-    XXH3 with 128 bits (Collet 2019) is as fast as memory and detects damage, but not forgery.
+    XXH3 with 128 bits (Collet 2019) runs at memory bandwidth and detects damage, but not forgery.
 
     Raises
     ------

@@ -34,7 +34,10 @@ def gate_radius(size_keys: F8, gate_m: float) -> F8:
 
 @dataclass
 class _Active:
-    """The tracks that have not ended, or new ones at detections, one per row, in order of birth."""
+    """Tracks that have not ended, or that detections have just started, one per row by birth.
+
+    Positions (n, 3) are in metres, velocities (n, 3) in m/s.
+    """
 
     ids: I4
     position: F8

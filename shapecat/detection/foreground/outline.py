@@ -54,10 +54,10 @@ class Outline(NamedTuple):
 
 @kernel(inline=True)
 def width_of_part(inv_depth: F4, cells: I4, count: int) -> float:
-    """Return the width of a part along the rows: cells times its depth in metres.
+    """Return the width of a part along the rows, in cells at a depth of 1 m.
 
-    ``inv_depth`` is (rows, columns), 1/m; the first ``count`` elements of ``cells`` are the flat
-    indices of the part's cells.
+    That is its width in cells times the depth of its first cell, metres. ``inv_depth`` is (rows,
+    columns), 1/m; the first ``count`` elements of ``cells`` are the flat indices of its cells.
     """
     columns = inv_depth.shape[1]
     first, last = columns, 0

@@ -241,8 +241,9 @@ def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple
 def _find_level(inv_depth: F4, i: int, slope: tuple[float, float, float], level: Bool) -> None:
     """Mark the cells of row i that are on level surface. The loop vectorises.
 
-    ``slope`` is the rise, along up, of the row's rays at depth 1: in column 0, and its change per
-    column and per row. ``level`` (columns,) is written.
+    ``slope`` is the component along up of the ray at depth 1 through column 0 of the row, and how
+    much it changes from one column, and from one row, to the next. ``inv_depth`` is (rows,
+    columns), 1/m. ``level`` (columns,) is written, except for `ARM` columns at each end.
     """
     start, across, down = slope
     steep = np.float32(0.5 * ARM) * np.sqrt(across * across + down * down)

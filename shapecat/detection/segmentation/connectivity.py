@@ -114,8 +114,8 @@ def _part_steps(grid: DepthGrid, plane_id: I4, i: int, start: int, end: int, lin
     At a step the depths change more from one cell to the next than before and after it. A plane
     fitted to a window that spans the step treats it as a slope, so that a plate would be linked
     with the can it stands on. A link stays if one side has that slope too, as at the edge of a
-    surface seen at a grazing angle. The object cells of row ``i`` are from column ``start`` to
-    before ``end``; ``plane_id`` is as in `HeightMap`, ``links`` as in `SurfaceGraph`, but with the
+    surface seen at a grazing angle. The object cells of row ``i`` are in columns ``start`` to
+    ``end - 1``; ``plane_id`` is as in `HeightMap`, ``links`` as in `SurfaceGraph`, but with the
     bits of `BENT`, which are cleared.
     """
     inv_depth, jump = grid.inverse_depth, grid.discontinuity

@@ -124,7 +124,7 @@ def labelled_part(found: Labelling, true: Labelling) -> Labelling:
 def _is_ignored(item: LabelledItem, ignored: Bool | None) -> bool:
     """Return whether most pixels of an object are marked in ``ignored``.
 
-    These are marks of the n pixels of the flattened image; None marks none.
+    ``ignored`` (n,) marks pixels of the flattened image; None marks none.
     """
     if ignored is None or item.pixels is None or not item.pixels.size:
         return False

@@ -94,7 +94,7 @@ def _place(row: Mapping[str, str], *, several: bool) -> Place:
 
 
 def _sensor_from_rectified(path: Path) -> F8:
-    """Return the rotation (3, 3) from a calibration file; the identity if it does not state one."""
+    """Return the rotation (3, 3) from a calibration file; the identity if none is stated."""
     text = path.read_text("utf-8") if path.is_file() else ""
     lines = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
     transform = lines.get("Tr_rect_to_sensor", "1 0 0 0 0 1 0 0 0 0 1 0")

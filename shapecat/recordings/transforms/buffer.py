@@ -105,7 +105,7 @@ class TransformBuffer:
         parent_from_child : translation (x, y, z) in metres and quaternion (x, y, z, w).
         static : whether it is valid whenever ``child`` has no other transform; ``stamp_ns`` is then
             ignored.
-        latched : whether it is valid until the next one, however late that is.
+        latched : whether the last transform of ``child`` remains valid for ever.
         log_time_ns : its log time; None if it is unknown.
 
         Returns

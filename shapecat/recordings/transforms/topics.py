@@ -38,7 +38,7 @@ def transform_topics(recording: Recording, sensor_topics: Sequence[str] = ()) ->
 
 
 def is_latched(kind: str) -> bool:
-    """Return whether transforms of a message type hold until the next one, as Foxglove's do."""
+    """Return whether the last transform of a message type stays valid, as Foxglove's do."""
     return ros_counterpart(kind) in TF_TYPES and kind not in TF_TYPES
 
 

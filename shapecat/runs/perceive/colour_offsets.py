@@ -59,7 +59,10 @@ class _Stream:
             self.speeds.append(0.0 if explained else moved / seconds)
 
     def speed(self) -> float:
-        """Return the usual speed, m/s; 0 if it is unknown."""
+        """Return the median speed of the objects relative to the camera, m/s.
+
+        It is 0 if too few motions were measured.
+        """
         return float(np.median(self.speeds)) if len(self.speeds) >= _MIN_MOTIONS else 0.0
 
 

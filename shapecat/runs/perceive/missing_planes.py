@@ -55,7 +55,8 @@ def _reason(distances: Sequence[F4], range_m: float, source: str) -> str:
     """Return the likely reason why frames have no plane.
 
     ``distances`` holds an array (n,) for each frame, the distances of its points in metres;
-    ``range_m`` is the range of detection; ``source`` is the source of the up direction.
+    ``range_m`` is the range of detection; ``source`` says where the up direction is from, as in
+    run.json.
     """
     if not distances:
         return "they have no valid depth"

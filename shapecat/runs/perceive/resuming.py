@@ -147,7 +147,7 @@ def _perception_differences(run: RunInfo, planned: RunInfo) -> dict[str, str]:
 
 
 def _result_differences(run: RunInfo, planned: RunInfo) -> dict[str, str]:
-    """Return the `differences` of two runs, except in which outputs were requested."""
+    """Return the `differences` of two runs, apart from those in the requested outputs."""
     found = differences(run, planned).items()
     return {name: text for name, text in found if name not in OUTPUT_OPTIONS}
 
