@@ -17,7 +17,7 @@ from .render import print_json, print_table
 @array_option
 @click.pass_context
 def info(ctx: click.Context, /, *, recordings: tuple[Path, ...], as_json: bool) -> None:
-    """List the topics of recordings, and the depth streams that `process` uses.
+    """List the topics of recordings, and the depth streams to process.
 
     Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), or a folder
     with recordings.
