@@ -37,7 +37,7 @@ def report_up(poses: PoseFinder, folder: Path) -> dict[str, Any]:
 
 
 def explain_up(poses: PoseFinder, folder: Path, report: Mapping[str, Any]) -> Iterator[str]:
-    """Yield warnings about transforms, unknown poses, and an up direction that no plane confirms.
+    """Yield warnings about transforms, unknown poses, and planes that disagree with up.
 
     The problems of transforms are failed look-ups, gaps, and contradictions at equal stamps.
 
