@@ -267,6 +267,20 @@ def test_mouth_of_cup_seen_from_above_is_filled(width: int, torn: int, filled: b
     assert cells.sum() == filled * (width - 2 * torn) ** 2
 
 
+def test_table_between_the_parts_of_a_drill_is_not_a_hole() -> None:
+    """Motor, grip and base enclose it on three sides, and it is larger than they are.
+
+    It would make the drill a quarter wider, and another shape.
+    """
+    inv_depth = np.full((40, 40), 1.25, np.float32)
+    labels, filled = np.zeros((40, 40), np.int16), np.zeros((40, 40), np.uint8)
+    labels[5:9, 5:30] = labels[9:30, 5:9] = labels[30:34, 5:30] = 1
+    inv_depth[labels == 0] = 1.1
+    labels[2:38, 36] = 2  # another object farther right, so that the rows end there
+    fill_holes(DepthGrid(inv_depth, INTRINSICS, 1, DISCONTINUITY), labels, 2, filled)
+    assert not filled.any()
+
+
 def test_background_of_large_image_is_not_a_hole() -> None:
     """The product of its open sides (six gaps of a rack) and its cells exceeds 32 bits."""
     inv_depth = np.full((632, 632), 0.5, np.float32)

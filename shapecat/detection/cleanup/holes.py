@@ -27,7 +27,8 @@ def fill_holes(grid: DepthGrid, labels: I4, count: int, filled: U1) -> None:
 
     A hole is a connected component of unlabelled samples between labels. It is filled if most of
     its boundary has one label, and all other labels on the boundary are in front of it. In
-    addition, the surface must continue into the hole, or the hole must be large.
+    addition, the surface must continue into the hole, or the hole must be large and closed: the
+    table between the grip and the base of a drill is not part of it.
 
     Parameters
     ----------
@@ -137,11 +138,9 @@ def _owner_of(sides: I4, total: int, area: int, label_area: I4) -> int:
         best = k if sides[k, BOUNDARY] > sides[best, BOUNDARY] else best
     if sides[best, BOUNDARY] <= CLEANUP.enclosed_share * total:
         return 0
-    # In a cup seen from above, the inner wall is hidden, but the mouth is large.
-    if (
-        sides[best, CONTINUOUS] <= CLEANUP.continuous_share * total
-        and area <= CLEANUP.mouth_share * label_area[best]
-    ):
+    # In a cup seen from above, the inner wall is hidden, but the mouth is large, and closed.
+    mouth = sides[best, BOUNDARY] == total and area > CLEANUP.mouth_share * label_area[best]
+    if sides[best, CONTINUOUS] <= CLEANUP.continuous_share * total and not mouth:
         return 0
     for k in range(1, len(sides)):
         if k != best and sides[k, IN_FRONT] < sides[k, BOUNDARY]:

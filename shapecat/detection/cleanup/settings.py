@@ -46,8 +46,8 @@ class CleanupSettings(NamedTuple):
     """Minimum fraction of the boundary of a hole where the surface continues. For the hole of a
     handle, the fraction is smaller."""
     mouth_share: float = 0.5
-    """Minimum area, relative to the object around it, of a hole into which the surface does not
-    continue. The mouth of a cup seen from above is larger, the hole of a handle smaller."""
+    """Minimum area, relative to the object around it, of a closed hole into which the surface does
+    not continue. The mouth of a cup seen from above is larger, the hole of a handle smaller."""
 
 
 CLEANUP = CleanupSettings()
