@@ -19,7 +19,7 @@ __all__ = ["completed", "label_file", "require_replaceable", "written_paths"]
 
 
 def written_paths(out: Path, format: str) -> list[Path]:  # noqa: A002  the word users know
-    """Return the paths that `simulate` writes: recording, ground truth, labels, colour labels."""
+    """Return the paths that `simulate` may write: recording, truth, labels, colour labels."""
     suffix = CONTAINERS[format].suffix
     out = out if out.suffix or not suffix else out.with_name(out.name + suffix)
     ends = ("truth.json", "labels.npz", "color_labels.npz")
@@ -88,7 +88,8 @@ def _move(hidden_path: Path, path: Path) -> None:
 def label_file(path: Path, frames: int, camera: Camera) -> Iterator[Callable[[U1], None]]:
     """Open a compressed .npz file of pixel labels; provide a function that adds those of a frame.
 
-    Its only array is ``labels`` (frames, h, w), uint8.
+    The function must be called once for each of the ``frames`` frames. The only array in the file
+    is ``labels`` (frames, h, w), uint8; ``camera`` gives h and w.
     """
     # ZipInfo's fixed date makes equal labels give equal bytes.
     member = zipfile.ZipInfo("labels.npy")

@@ -33,6 +33,7 @@ EPOCH_NS = 1_700_200_000_000_000_000
 """Timestamp of the first frame."""
 
 _LATENCY_NS = 12_000_000
+"""Time from the timestamp of a depth image to its log time."""
 _OPTICAL = "camera_depth_optical_frame"
 _COLOUR_OPTICAL = "camera_color_optical_frame"
 

@@ -25,7 +25,8 @@ def frame_truth(world: World, frame: int, labels: U1, camera: Camera) -> dict[st
     """Return the ground truth of a frame as JSON values.
 
     The keys are ``objects``, ``hidden`` (objects with fewer than `LISTED_PIXELS` depth pixels) and
-    ``planes`` (the supports that hold objects).
+    ``planes`` (the supports that hold objects). Boxes and planes are in the optical frame; the
+    ``center`` of an object and the ``height`` of a plane are in the world frame; metres.
 
     Parameters
     ----------

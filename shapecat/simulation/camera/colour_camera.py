@@ -31,6 +31,7 @@ DEPTH_FROM_COLOUR = Pose(
 _NOTHING = 18
 """Value of red, green and blue where no surface is visible."""
 _GRAIN_M = 0.005
+"""Size of the cells of the textures' fine grain."""
 _HASH_FACTORS = (73856093, 19349663, 83492791)
 """Factors of the spatial hash that gives each cell of the grain its brightness."""
 _BAND = 0.6

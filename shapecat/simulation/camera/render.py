@@ -14,7 +14,8 @@ from shapecat.types import Camera, Pose
 __all__ = ["Geometry", "Image", "cropped", "geometry", "pixels_if_unoccluded", "render"]
 
 NEAR_M = 0.02
-"""A triangle is skipped if all corners are nearer than this; if some are, all pixels are tested."""
+"""A triangle is skipped if all its corners have at most this depth. If some have, all pixels of the
+image are tested, not only those around the triangle."""
 
 
 class Geometry(Record):
@@ -155,7 +156,8 @@ def _rasterize(
 
     ``points`` (n, 3) are in the optical frame, metres; ``intrinsics`` are fx, fy, cx, cy in pixels.
     Where a pixel shows a triangle, write its inverse depth (1/m) into ``nearest`` (h, w), and its
-    index into ``triangle_ids`` (h, w). Write the normals of the triangles into ``normals`` (m, 3).
+    index into ``triangle_ids`` (h, w). Write the unit normals of the triangles, pointing away from
+    the camera, into ``normals`` (m, 3).
     """
     height, width = nearest.shape
     fx, fy, cx, cy = intrinsics

@@ -44,7 +44,7 @@ class _SceneSpec:
     categories: tuple[str, ...]
 
     def draw(self, rng: Generator, count: int, *, unknown: int = 0) -> list[str]:
-        """Draw the categories of ``count`` objects; append those of ``unknown`` unknown objects.
+        """Draw the categories of ``count`` objects; append `UNKNOWN` ``unknown`` times.
 
         No category repeats before all have appeared.
         """

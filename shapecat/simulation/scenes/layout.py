@@ -32,7 +32,7 @@ _EDGE_M = 0.01
 
 
 class Piece(Record):
-    """An object to be placed, with its stable pose."""
+    """An object to be placed, with its stable pose; other fields are as in `PlacedObject`."""
 
     category: str
     kind: str
@@ -215,7 +215,10 @@ class Layout:
     def _add(
         self, piece: Piece, turn: Pose, placed: Footprint, support: Support, on_track: int | None
     ) -> None:
-        """Add a piece, moved by ``turn``, on a support or object; ``placed`` is its footprint."""
+        """Add a piece, moved by ``turn``; ``placed`` is its footprint there.
+
+        ``support`` is the support below it, also if it stands on the object ``on_track``.
+        """
         pose = compose(turn, piece.stable_pose.pose)
         self.objects.append(place_piece(piece, len(self.objects), pose, support, on_track))
         self._places.append(placed)

@@ -30,7 +30,8 @@ Range = float | tuple[float, float]
 def looking_at(eye: F8, target: F8, *, roll: float = 0.0) -> Pose:
     """Return the pose of a camera at ``eye`` (3,) that looks at ``target`` (3,).
 
-    ``roll`` is in radians. The pose is rounded, so that it is the same on every machine.
+    The line of sight must not be vertical; ``roll`` is in radians. The pose is rounded, so that it
+    is the same on every machine.
     """
     forward = np.asarray(target, np.float64) - eye
     forward /= np.linalg.norm(forward)

@@ -15,6 +15,7 @@ from shapecat.types import Pose
 __all__ = ["Drop", "SettledPose", "settle"]
 
 _STEP_S = 0.004
+"""Time step of the simulation."""
 _DENSITY = 400.0
 """Density of a solid object, kg/m3."""
 _HOLLOW_DENSITY = 1000.0
@@ -22,7 +23,7 @@ _HOLLOW_DENSITY = 1000.0
 _START_SPEED = 0.1
 """Downward speed at the start of a drop, m/s."""
 _FRICTION = (0.7, 0.005, 0.002)
-"""Sliding, torsional and rolling friction."""
+"""Coefficients of sliding (no unit), torsional and rolling friction (metres)."""
 _CLEARANCE_M = 0.02
 """Height of a dropped object above the highest object below it."""
 _FALL_STEPS = 75

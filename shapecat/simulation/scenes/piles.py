@@ -23,7 +23,10 @@ __all__ = ["Item", "bin_picking", "make_item", "pile", "settled", "shelf_bin"]
 _UPRIGHT = 0.45
 """Fraction of the objects that are dropped nearly upright; others get a random rotation."""
 _TILT_DEG = 8.0
+"""Standard deviation of the tilt of nearly upright objects about x and about y."""
 _UPRIGHT_COS, _LYING_COS = np.cos(np.radians(15)), np.sin(np.radians(15))
+"""Cosines of the angles between an axis and the vertical at 15 degrees from upright, and from
+lying."""
 _FALLEN_M = 0.02
 """Objects this far below the surface of their support have fallen off."""
 

@@ -19,6 +19,7 @@ from shapecat.types import Pose
 __all__ = ["rows"]
 
 _GAPS_M = (0.0005, 0.002, 0.005, 0.01, 0.02, 0.04)
+"""Distances between the objects of a group, of which one is drawn."""
 _SHIFT = 0.3
 """Maximum shift of the objects of an irregular group, as a fraction of the gap."""
 _MISSING = 0.15
@@ -133,8 +134,8 @@ class _Groups:
     ) -> None:
         """Add the objects of a group; a few that carry nothing may be left out at random.
 
-        ``corner`` (3,) is that of the group, metres, before it is turned. Each object is shifted at
-        random, by up to ``shift_m`` in x and y.
+        ``corner`` (3,) is the minimum corner of the group, metres, before ``turn`` moves it to its
+        support. Each object is shifted at random, by up to ``shift_m`` in x and y.
         """
         rng, missing = self._rng, _MISSING * self._rng.integers(2)
         carrying = {place.below for place in group}

@@ -151,7 +151,7 @@ _NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))
 
 
 def pose_from_yaw(angle: float, place: ArrayLike = (0, 0, 0)) -> Pose:
-    """Return a pose with this yaw, radians, as a matrix rounded to 1e-9, and at ``place`` (3,)."""
+    """Return the pose with yaw ``angle``, radians, at ``place`` (3,); rotation rounded to 1e-9."""
     c, s = np.round(np.cos(angle), 9), np.round(np.sin(angle), 9)
     return Pose(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.asarray(place))
 

@@ -89,6 +89,7 @@ def _gadget(rng: Generator) -> Mesh:
 
 
 _GADGET = ((0.05, 0.2), (0.03, 0.12), (0.012, 0.07))
+"""Ranges of the size of a gadget's body in x, y and z, metres."""
 
 
 def _power_tool(rng: Generator) -> Mesh:

@@ -53,7 +53,7 @@ def scaled(mesh: Mesh, factors: ArrayLike) -> Mesh:
 
 
 def moved(mesh: Mesh, pose: Pose) -> Mesh:
-    """Transform a mesh by a pose ``a_from_mesh``."""
+    """Transform a mesh by a pose ``frame_from_mesh``."""
     points = np.asarray(mesh.vertices, np.float64)
     turned = sum(points[:, k, None] * pose.rotation[:, k] for k in range(3))
     return Mesh(turned + pose.translation, mesh.triangles)
