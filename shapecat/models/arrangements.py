@@ -21,6 +21,7 @@ from shapecat.types import CATEGORIES, UNKNOWN, Pose
 __all__ = ["BARE_TABLE", "ArrangedObject", "Arrangement", "ArrangementOptions", "arrange", "placed"]
 
 _TABLE_M = (1.6, 1.2, 0.03)
+"""Size of the table top in x, y and z."""
 _RESTING_POSES = {
     "cup": {"upright": 0.78, "lying": 0.12, "upside_down": 0.1},
     "can": {"upright": 0.8, "lying": 0.2},
@@ -30,7 +31,9 @@ _RESTING_POSES = {
     "box": {"upright": 0.5, "lying": 0.5},
     UNKNOWN: {"upright": 0.7, "lying": 0.3},
 }
+"""Probabilities of the resting poses of each category; others are always upright."""
 _ROUND = {"cup", "can", "bottle"}
+"""Categories to which `ArrangementOptions.lying` applies."""
 _RESIZED = 0.3
 """Fraction of the tables on which one factor, in the range `_SIZES`, scales all objects."""
 _SIZES = (0.55, 1.5)

@@ -54,7 +54,7 @@ def remove_base(view: View, rng: np.random.Generator) -> View:
 
 
 def image_plane_points(view: View) -> F8:
-    """Project the points of a view onto a plane across the line of sight; (n, 2), metres."""
+    """Project a view's points onto a plane perpendicular to its line of sight; (n, 2), metres."""
     centre = view.points.mean(axis=0, dtype=np.float64)
     sight = view.eye - centre
     sight /= np.linalg.norm(sight)

@@ -90,9 +90,9 @@ def uprighted(mesh: Mesh, category: str) -> Mesh:
     """Turn a mesh upright; its category tells which of the six axis directions is up.
 
     The axis of a can is the one along which its outline looks roundest. For the axis of a bottle,
-    its length counts, too, and the narrow end is up. A cup, bowl or plate is turned so that its
-    inside, seen from above, lies as deep as possible below its top. A box or a ball keeps the axes
-    of the file.
+    its length counts, too, and the narrow end is up. A box or a ball keeps the axes of the file.
+    Any other mesh, such as a cup, is turned so that its inside, seen from above, lies as deep as
+    possible below its top.
     """
     points = np.asarray(mesh.vertices, np.float64)
     points = points - (points.min(axis=0) + points.max(axis=0)) / 2

@@ -34,6 +34,7 @@ from shapecat.types import UNKNOWN
 __all__ = ["evaluate_model"]
 
 _TRACK_SEED, _TRACK_TABLES = 100_006, 24
+"""Seed and number of the simulated tables on which fusion is evaluated."""
 _DRAWN = 20
 """Number of test arrangements in which to look for the worst mistakes."""
 _HEAD = ("", "views", "accuracy", "balanced", "ECE", "known rejected", "unknown rejected", "AUROC")

@@ -61,7 +61,7 @@ def _frames(folder: Path) -> Iterator[tuple[Frame, dict[str, Any]]]:
 
 
 def _best_overlap(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int | None:
-    """Return the index of the candidate with the best IoU; None if that is below `_OVERLAP`.
+    """Return the index of the candidate with the best IoU; None if none reaches `_OVERLAP`.
 
     ``image`` (h * w,) are the labels of the pixels, ``item`` is the truth of the object.
     """
@@ -74,7 +74,7 @@ def _best_overlap(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int 
 
 
 def _nearest(scene: Scene, item: dict[str, Any]) -> int | None:
-    """Return the index of the candidate nearest to an object; None if it is too far away.
+    """Return the index of the candidate nearest to an object; None if all are too far away.
 
     ``item`` is the truth of the object. Half its largest extent is too far.
     """

@@ -27,6 +27,7 @@ _WIDTHS = (224, 1280)
 _OFTEN = {"kinect": 3.0, "realsense": 2.0}
 """Weights of the most common sensors; others have weight 1."""
 _DISTANCES_M = (0.25, 3.0)
+"""Minimum and maximum distance of the camera from its target."""
 _CLOSER_M = 0.03
 """Minimum distance by which the target is beyond the sensor's near limit."""
 

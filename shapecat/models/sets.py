@@ -37,6 +37,7 @@ _SHARES: dict[str, dict[str, Any]] = {
     "calibration": {"unknown": 0.17, "settled": 0.5},
     "test": {"unknown": 0.3, "settled": 0.5},
 }
+"""Parameters in `ArrangementOptions` of each set."""
 WELL_SEGMENTED_IOU = 0.75
 """Minimum IoU of a well segmented detection."""
 MOSTLY_VISIBLE = 0.7

@@ -42,7 +42,9 @@ from shapecat.types import UNKNOWN, Candidate, Scene
 __all__ = ["SimulatedView", "simulate_arrangement", "simulate_mesh", "simulate_views"]
 
 _LEAST_VISIBLE = 0.3
+"""Minimum visible fraction of an object that is described."""
 _OVERLAP = 0.5
+"""Minimum IoU of a detection and its object."""
 _BACKGROUND = 0.1
 """Maximum fraction of object pixels in a detection of background."""
 _THIN_M = 0.03

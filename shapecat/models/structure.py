@@ -260,7 +260,7 @@ def _with_arms(
 
 
 def label_objects(frame: Frame, pixel_labels: U1, object_labels: I4) -> Iterator[Samples]:
-    """Yield the merged segments of a frame; nothing if it shows no supporting plane.
+    """Yield the merged segments of a frame; nothing without depth in range or a supporting plane.
 
     Parameters
     ----------
