@@ -50,8 +50,8 @@ class CommonMotion:
     def unstabilised(self, rows: I4, places: F8) -> F8:
         """Transform ``places`` (k, 3), metres, from the frame of the still objects back.
 
-        The result is in the coordinate frame of the detections. ``rows`` (k,) is the index of the
-        image at whose time each place is wanted.
+        The result (k, 3) is in the coordinate frame of the detections. ``rows`` (k,) is the index
+        of the frame to which each place belongs.
         """
         return np.asarray(
             np.einsum("kji,kj->ki", self.rotations[rows], places - self.translations[rows])
@@ -59,9 +59,10 @@ class CommonMotion:
 
 
 def find_common_motion(table: DetectionTable, tracks: Sequence[I4]) -> CommonMotion | None:
-    """Find the motion that all objects have in common, relative to the sensor, if there is one.
+    """Find the motion that all objects have in common, if there is one.
 
-    In each frame it is a rotation about the up direction and a horizontal translation.
+    In each frame it is a rotation about the up direction and a horizontal translation, in the
+    coordinate frame of the detections.
 
     Parameters
     ----------

@@ -16,6 +16,7 @@ __all__ = ["DetectionTable", "TableBuilder"]
 _BLOCK = 2**16  # detections processed at once
 _SET_BACK_NS = 1_000_000_000  # a clock was set back by more than this; late messages differ by less
 
+# Type of each column, and for detections the shape of an item; "c" is the category axis.
 _OF_FRAMES = {"topics": "i4", "frames": "i4", "stamps_ns": "i8", "counts": "i4"}
 _OF_DETECTIONS: dict[str, tuple[str, tuple[Any, ...]]] = {
     "numbers": ("i4", ()),
@@ -41,9 +42,10 @@ class DetectionTable:
     ----------
     names : the topics of the stream.
     topics, frames, stamps_ns : (f,) index into ``names``, number and time of each frame.
-    first : (f + 1,) index of the first detection of each frame.
+    first : (f + 1,) index of the first detection of each frame, and n at the end.
     rows : (n,) index of the frame of each detection, ascending.
-    numbers : (n,) number of each detection, by which `Track.detections` refers to it.
+    numbers : (n,) number of each detection, by which `Track.detections` refers to it; in a run, its
+        row in the detections table.
     centers : (n, 3) centres of the boxes, metres, in the fixed frame; in the sensor frame if its
         pose is unknown. All frames of a stream use the same coordinate frame.
     sizes : (n, 3) lengths of the boxes, metres; the third one is along the up direction.

@@ -24,6 +24,7 @@ _FLOOR = 1e-6
 """Smallest probability of a single view in a product, so that no view can veto all others."""
 
 _BLOCK = 2**16
+"""Number of views processed at once."""
 
 
 def view_weights(partial: Bool) -> F8:

@@ -66,7 +66,7 @@ def _where(mask: Bool) -> list[int]:
 
 
 def _whole_lengths_by_topic(table: DetectionTable, track: I4) -> F8:
-    """Return the whole object's lengths (topics, 3) as seen by each topic, metres; 0 if unseen."""
+    """Return `_whole_lengths` (topics, 3) of a track as seen by each topic, metres; 0 if unseen."""
     topics = table.topics[table.rows[track]]
     result = np.zeros((len(table.names), 3))
     for topic in _where(np.bincount(topics) > 0):
@@ -75,7 +75,7 @@ def _whole_lengths_by_topic(table: DetectionTable, track: I4) -> F8:
 
 
 def _whole_lengths(table: DetectionTable, track: I4) -> F8:
-    """Return the 75th percentile (3,) of the lengths of whole views, or of all if none is whole."""
+    """Return the 75th percentile (3,) of `sorted_sides` of whole views; of all if none is whole."""
     uncut = track[~table.partial[track]]
     lengths = sorted_sides(table.sizes[track if len(uncut) == 0 else uncut])
     return np.asarray(np.quantile(lengths, 0.75, axis=0))

@@ -21,7 +21,7 @@ __all__ = ["track_recording"]
 _BURST_NS = 500_000_000
 """Frames this near to a track's first one decide how many detections confirm it."""
 
-_GAP_S, _GAP_FRAMES = 0.7, 5  # after a longer gap, the next detection begins a new fragment
+_GAP_S, _GAP_FRAMES = 0.7, 5  # after a gap longer than both, a new fragment begins
 _LINE = 10  # detections at either end of a track from which its motion is estimated
 
 

@@ -193,11 +193,11 @@ def scene_cuts(table: DetectionTable, settings: TrackingSettings) -> Bool:
 def _with_neighbours(
     table: DetectionTable, filled: I4, topic: int
 ) -> Iterator[tuple[int, int, int, int, int]]:
-    """Yield each of a topic's frames with detections, except the first, and four of its frames.
+    """Yield the row of each frame of a topic with detections, except the first, and four others.
 
-    These are the previous frame with detections, the previous frame, the second previous one with
-    detections, and the next one with detections; -1 stands for a missing frame. ``filled`` (k,) are
-    the rows of all frames with detections.
+    The others are the rows of the topic's previous frame with detections, its previous frame, its
+    second previous frame with detections, and its next frame with detections; -1 if there is none.
+    ``filled`` (k,) are the rows of all frames with detections.
     """
     frames, nonempty = np.flatnonzero(table.topics == topic), filled[table.topics[filled] == topic]
     before = frames[np.searchsorted(frames, nonempty) - 1]
@@ -212,10 +212,11 @@ def _continues(
 ) -> bool:
     """Return whether frames i and j may show the same scene: at least half of the objects match.
 
-    A partial view may be smaller than its object. If the frames are ``slow``, that is, more than
-    0.3 s apart, positions and posteriors must agree more closely, but less so in partial views.
-    Then it is also enough that most objects, and at least two, have moved together, on a belt or as
-    seen by a moving sensor: unrelated images rarely look like that.
+    They also may if no objects are near enough to be compared. A partial view may be smaller than
+    its object. If the frames are ``slow``, that is, more than 0.3 s apart, positions and posteriors
+    must agree more closely, but less so in partial views. Then it is also enough that most objects,
+    and at least two, have moved together, on a belt or as seen by a moving sensor: unrelated images
+    rarely look like that.
     """
     a, b = table.of_frame(i), table.of_frame(j)
     offsets = table.centers[b][None] - table.centers[a][:, None]

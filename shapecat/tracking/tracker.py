@@ -34,7 +34,7 @@ def gate_radius(size_keys: F8, gate_m: float) -> F8:
 
 @dataclass
 class _Active:
-    """Tracks that have not ended, or that detections have just started, one per row by birth.
+    """Tracks that have not ended, or that detections have just started; rows in order of birth.
 
     Positions (n, 3) are in metres, velocities (n, 3) in m/s.
     """
