@@ -1,1 +1,1 @@
-"""Atomic files and folders, locks, signals that ask to stop, progress, and garbage collection."""
+"""Atomic files and folders, locks, signals, progress, memory, standard streams, and imports."""

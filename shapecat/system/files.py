@@ -42,7 +42,7 @@ _UNLOCKED_S = 60
 
 
 def partial_path(path: Path) -> Path:
-    """Return the hidden path of a file or folder until it is complete.
+    """Return the hidden path that a file or folder has until it is complete.
 
     Raises
     ------
@@ -116,6 +116,7 @@ def complete_folder(folder: Path) -> Iterator[Path]:
     Raises
     ------
     OSError : the folder cannot be written, or exists and is not empty.
+    OutputError : as for `partial_path`.
     """
     hidden = partial_path(folder)
     shutil.rmtree(hidden, ignore_errors=True)

@@ -39,7 +39,7 @@ def observed(
 
 
 def kernel_words(phase: str, done: int) -> str:
-    """Describe a progress report of a phase that compiles kernels; ``done`` is 0 in the first.
+    """Return the progress of `COMPILE` or `WAIT_FOR_KERNELS` as text; ``done`` counts kernels.
 
     Examples
     --------
