@@ -31,7 +31,10 @@ _LOST = {
     *("WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"),  # Ray
 }
 _DROPPED = {"CancelledError", "FutureCancelledError", "CommClosedError"}
-"""Names of errors that mean a lost worker, and a lost scheduler; Dask and Ray may be missing."""
+"""Names of the errors that mean a lost worker, and of those that mean a lost scheduler.
+
+They are compared by name, since Dask and Ray may not be installed.
+"""
 
 
 def open_executor(name: str, *, workers: int, address: str | None = None) -> WorkerExecutor:
@@ -45,8 +48,8 @@ def open_executor(name: str, *, workers: int, address: str | None = None) -> Wor
 
     Raises
     ------
-    ConfigError : the library is not installed, nothing answers at the address, or ``local`` is
-        given an address.
+    ConfigError : the library is not installed or does not start, nothing answers at the address,
+        or ``local`` is given an address.
     """
     if name == "dask":
         from shapecat.executors.dask import open_dask  # noqa: PLC0415  an extra

@@ -13,6 +13,7 @@ __all__ = ["open_dask"]
 
 _ANSWER_S = 30
 _CLOSE_S = 10
+"""Longest waits for the scheduler to answer, and for the client and its cluster to close."""
 
 
 class _DaskExecutor(WorkerExecutor):
@@ -46,7 +47,7 @@ class _DaskExecutor(WorkerExecutor):
         self._close(1)
 
     def _is_cut_off(self) -> bool:
-        """Return whether the client gave up: it refuses calls, or accepts them and forgets them."""
+        """Return whether the client has given up: it then refuses calls, or never runs them."""
         return self._client.status in {"closing", "closed"}
 
     def _close(self, timeout_s: float) -> None:

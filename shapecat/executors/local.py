@@ -150,7 +150,7 @@ class LocalExecutor(WorkerExecutor):
             return self._workers[slot]
 
     def _retire(self, slot: int) -> None:
-        """Wait for the outstanding results of a worker, and for its end."""
+        """Wait for the results and the end of the worker in a slot, if any; then remove it."""
         worker = self._workers.get(slot)
         if worker is not None:
             worker.end()

@@ -108,7 +108,10 @@ class OrderedPool(Generic[_Item, _Result]):
     def _begin(
         self, item: _Item, pending: Sequence["_Pending[_Item, _Result]"]
     ) -> "_Pending[_Item, _Result]":
-        """Send an item to another process if one has started and has room, else work on it here."""
+        """Send an item to another process if one has started and has room, else work on it here.
+
+        ``pending`` are the earlier items whose results have not been yielded.
+        """
         started = sum(future.done() for future in self._warming_up)
         unfinished = sum(not each.done() for each in pending)
         has_room = unfinished < _MOST_PER_PROCESS * started
@@ -143,7 +146,7 @@ class _Pending(Generic[_Item, _Result]):
             self._future = _done(self._work, self._item.pop())
 
     def result(self) -> _Result:
-        """Return the result; work on the item here if another process failed."""
+        """Return the result; work on the item here if it was not sent or another process failed."""
         self.recall()
         error = self._future.exception()
         if error is None or not self._item:

@@ -12,6 +12,7 @@ from typing import Any, Self
 __all__ = ["ProgressReceiver", "send_progress"]
 
 _MOST_BYTES = 4096
+"""Largest message; larger ones are dropped."""
 _SHORT_FOLDER = "/tmp"  # noqa: S108  the folder in it is private
 """The path of a socket has at most 107 bytes; that of the temporary folder may be longer."""
 
