@@ -14,7 +14,7 @@ from shapecat.runs.tables.masks import read_nearest_masks
 
 __all__ = ["ImageBox", "ImageFrame", "image_encoders_for", "read_image_frames"]
 
-_LINE_LOOP = 2
+_LINE_LOOP = 2  # ``type`` of a closed PointsAnnotation
 
 
 class ImageBox(NamedTuple):

@@ -102,7 +102,7 @@ class Appender:
     ----------
     file : open for writing, positioned at the end of the original data section.
     summary : the summary of the original file.
-    compression : compression of the new chunks: ``zstd``, ``lz4`` or empty.
+    compression : compression of the new chunks: ``zstd`` or ``lz4``; anything else means none.
     """
 
     def __init__(self, file: BinaryIO, summary: Summary, compression: str) -> None:
@@ -265,7 +265,10 @@ class Appender:
 
 
 def _message_index(channel: int, entries: Sequence[int]) -> bytes:
-    """Encode a message index record; the library would take a microsecond per number."""
+    """Encode a message index record; the library would take a microsecond per number.
+
+    ``entries`` are log times and offsets, alternating.
+    """
     size = 8 * len(entries)
     numbers = struct.pack(f"<{len(entries)}Q", *entries)
     return _INDEX.pack(Opcode.MESSAGE_INDEX, 2 + 4 + size, channel, size) + numbers

@@ -37,7 +37,8 @@ def rewrite(
     Parameters
     ----------
     channels : the channels of the annotations.
-    items : the annotations by log time, each with the index of its channel in ``channels``.
+    items : the annotations in the order of log time; each has the index of its channel in
+        ``channels``.
     metadata : content of the metadata record ``shapecat``.
     """
     writer = Writer(file, compression=CompressionType.LZ4)
