@@ -88,7 +88,7 @@ def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
     """Return ``train`` or ``val`` for each run; runs of the same recording are in the same split.
 
     Recordings are drawn in the order of hashes of their content, so that further runs change few
-    splits. A single recording goes to the training split.
+    splits. At least one recording goes to the training split.
 
     Parameters
     ----------
@@ -200,7 +200,10 @@ _File = tuple[str, bytes, tuple[int, int], tuple[Mask, ...]]
 
 
 def _colour_file(frame: Frame, coloured: Coloured | None) -> _File | None:
-    """Return suffix, content, (height, width) and masks of a colour image; None without one."""
+    """Return suffix, content, (height, width) and masks of a colour image.
+
+    The result is None without an image, or if it only holds the colours of an unorganized cloud.
+    """
     if coloured is None or coloured.view.image.height <= 1:
         return None
     image = coloured.view.image

@@ -95,7 +95,7 @@ def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
 
 
 class _View(NamedTuple):
-    """The camera of 2D boxes and ``P2`` (None without an image), and ``camera_from_sensor``."""
+    """Camera of 2D boxes and ``P2`` (None without an image); ``pose`` is ``camera_from_sensor``."""
 
     camera: Camera | None
     pose: Pose
