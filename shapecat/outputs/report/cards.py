@@ -26,7 +26,7 @@ __all__ = ["Card", "TrackCounts", "asset", "card_html", "count_cards", "frame_ht
 
 _LINES = 3  # categories in a timeline
 _MOST_STEPS = 80
-_DIGITS = 9
+_DIGITS = 9  # the last digit key
 _ROOMY = 4  # largest number of boxes whose full labels fit in a frame of the strip
 
 
@@ -151,7 +151,7 @@ def _bars(line: Timeline, categories: Sequence[str], row: TrackRow, names: Seque
     """Return a button for each category, the most likely first, with a bar for its posterior.
 
     ``categories`` and ``names`` are as in `card_html`. If the track has a category that is not in
-    ``categories``, its button is the last one.
+    ``categories``, except unknown, its button is the last one.
     """
     shares = dict(zip(categories, line.fused.tolist(), strict=False))
     order = sorted(shares, key=lambda name: -shares[name])

@@ -24,6 +24,7 @@ _RANK = 0.8
 """Quantile, by size, of the chosen view in its quarter. It is below 1 because the largest masks
 often include a neighbour or a piece of the table."""
 _STRIP = 12
+"""Largest number of frames in the overview strip."""
 _PARTIAL = 0.2
 """Weight of a view that is cut off by the image border or partly occluded."""
 _COLOURLESS = 0.05

@@ -30,6 +30,7 @@ _FRAME_PX = 960
 _MARGIN = 1.5
 """Side of a crop, relative to the longer side of the object's box."""
 _LEAST_PX = 24
+"""Shortest side of a crop in the frame, unless the frame is smaller."""
 _GOOD_PX = 160
 """Square root of the mask area above which a larger object scores no higher."""
 _GOOD_DETAIL = 12.0
@@ -37,6 +38,7 @@ _GOOD_DETAIL = 12.0
 _NEARER = 0.015
 """A pixel occludes its neighbour if it is nearer by this many metres plus this share of depth."""
 _FAR_M = 6.0
+"""Range of the virtual camera that shows a cloud."""
 _SAME_SURFACE = 0.02
 """Neighbours whose inverse depths differ by less than this fraction are on the same surface."""
 _NEAR_TONE, _FAR_TONE = np.array([[255, 238, 205], [92, 112, 168]], np.float32)
@@ -47,7 +49,7 @@ _LIGHT = np.array([-0.45, -0.65, -0.62], np.float32)
 
 
 Window = tuple[int, int, int, int]
-"""Left, top, right and bottom, pixels."""
+"""Left, top, right and bottom, pixels; the last two are exclusive."""
 
 
 class FramePicture(Record):
@@ -216,7 +218,7 @@ def _slope(inverse: F4, axis: int) -> F4:
 def encode(pixels: U1, *, quality: int = 72) -> tuple[str, int, int]:
     """Return a picture as a data URI, shrunk to `_FRAME_PX` if larger, and its width and height.
 
-    ``pixels`` is (h, w, 3) or, with opacity, (h, w, 4).
+    ``pixels`` is (h, w, 3) or, with opacity, (h, w, 4); ``quality`` is that of WebP, 0 to 100.
     """
     image = Image.fromarray(np.ascontiguousarray(pixels))
     image.thumbnail((_FRAME_PX, _FRAME_PX))

@@ -31,8 +31,9 @@ _HOST = "127.0.0.1"
 _NAMES = frozenset({_HOST, "[::1]", "localhost"})
 _LABELS = "labels"
 """Name of the resource beside a page that holds the labels of its run."""
-_LARGEST_BODY = 1 << 16
+_LARGEST_BODY = 1 << 16  # bytes
 _PATIENCE_S = 30
+"""Longest time without data from a browser before its connection is closed."""
 _POLL_S = 0.05
 """Longest time until the server notices that it should stop."""
 _HEADERS = {

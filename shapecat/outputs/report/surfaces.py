@@ -20,6 +20,7 @@ _SHADES = 14
 _PASSES = 3
 """Number of times that holes are closed, and that nearness is smoothed."""
 MOST_POINTS = 8000
+"""Largest number of points of an object that are drawn."""
 _LIGHT = np.array([-0.4, 0.65, 0.65]) / np.linalg.norm([-0.4, 0.65, 0.65])
 
 
@@ -140,7 +141,10 @@ def _shade(spots: F8) -> U1:
 
 
 def _nearest(spots: F8) -> F8:
-    """Return the nearness (h, w) of the nearest disc at each pixel, -inf without a disc."""
+    """Return the nearness (h, w) of the nearest disc at each pixel, -inf without a disc.
+
+    ``spots``, the centres of the discs, is from `_project`.
+    """
     area = float(np.prod(np.ptp(spots[:, :2], axis=0) + 1))
     radius = float(np.clip(0.9 * np.sqrt(area / len(spots)), 1.0, 4.5))
     columns, rows = np.round(spots[:, :2].T).astype(int)
