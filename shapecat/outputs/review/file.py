@@ -17,8 +17,8 @@ from shapecat.system.files import replacing
 
 __all__ = ["ReviewFile", "forget_reviews", "open_review"]
 
-_BLOCK = 1 << 20
-_PATIENCE_S = 60.0
+_BLOCK = 1 << 20  # bytes
+_PATIENCE_S = 60.0  # for Rerun to write what is logged
 
 
 class ReviewFile:

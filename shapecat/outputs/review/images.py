@@ -19,9 +19,9 @@ from shapecat.types import LabelledFrame, LabelledObject
 
 __all__ = ["Images", "mask_layer"]
 
-_QUALITY = 85
-_OPACITY = 110
-_BYTES_PER_NUMBER = 4
+_QUALITY = 85  # of JPEG
+_OPACITY = 110  # of masks, from 0 to 255
+_BYTES_PER_NUMBER = 4  # converts the size of a file for `Columns.add`
 
 
 def _file_of(image: ColourImage) -> tuple[bytes, str]:

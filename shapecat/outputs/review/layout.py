@@ -69,7 +69,7 @@ def choose_eye(labelled: LabelledFrame, frame: Frame, *, fixed: bool) -> Eye:
 def stepped_back(eye: Eye, low: F8, high: F8) -> Eye:
     """Aim an eye at the box between two corners (3,), metres, and move it back to see the box.
 
-    If the box is too large, the eye is returned unchanged.
+    If the box is too large or empty, the eye is returned unchanged.
     """
     radius = float(np.linalg.norm(high - low) / 2) + 0.1
     if not radius <= _WIDEST_M:

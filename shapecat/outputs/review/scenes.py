@@ -19,7 +19,7 @@ _SOON_NS = 90_000_000
 _LATE_NS = 240_000_000
 """Longest time between two drawn scenes, unless one only repeats the other."""
 _STILL_M = 0.015
-"""After a motion of this size, the scene is drawn as soon as allowed."""
+"""If an object has moved farther than this, the scene is drawn as soon as allowed."""
 
 
 class ReviewFrame(NamedTuple):

@@ -255,7 +255,7 @@ def pinhole(camera: Camera) -> rr.Pinhole:
 
 
 def markdown(values: Mapping[str, object], level: int = 1) -> str:
-    """Return nested values as Markdown headings and lists."""
+    """Return nested values as Markdown lists, and headings from level ``level + 1`` to 6."""
     lines = [
         f"- **{key}**: {_inline(v)}" for key, v in values.items() if not isinstance(v, Mapping)
     ]

@@ -23,7 +23,7 @@ from shapecat.system.files import require_utf8
 __all__ = ["open_viewer", "serve_viewer", "take_screenshot"]
 
 _SETTLE_S = 7.0  # until the viewer's notices have faded; everything else is drawn by then
-_LOAD_S = 30.0
+_LOAD_S = 30.0  # longest wait for the viewer to answer or to load a file
 _OPEN_S = 2.0
 """A viewer that cannot open a window ends within this time."""
 _SHOTS = 4

@@ -228,7 +228,10 @@ class _Review:
             self._columns.add(f"{entity}/{name}", at, scene, drawing, size=scene.size)
 
     def _place_sensor(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
-        """Write the axes and frustum of the sensor if they are new, and choose the topic's eye."""
+        """Write the axes and frustum of the sensor if they are new, and choose the topic's eye.
+
+        The eye is chosen at the first drawn frame, and again at the first one with objects.
+        """
         topic = labelled.topic
         if topic not in self._eyes or (labelled.objects and topic not in self._aimed):
             self._eyes[topic] = choose_eye(labelled, frame, fixed=self._fixed_frame is not None)
