@@ -118,7 +118,7 @@ class _Awaited:
 
 
 def _coloured(labelled: LabelledFrame, view: ColourView | None) -> Coloured | None:
-    """Return the colour image of a frame with the masks of its objects; None without an image."""
+    """Return a frame's colour image with the masks of its objects; None if either is missing."""
     if view is None or labelled.masks is None:
         return None
     masks = labelled.masks

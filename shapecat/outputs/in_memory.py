@@ -60,6 +60,8 @@ def frame_of(reading: ArrayLike | Frame, intrinsics: ArrayLike | Camera | None =
 def _points(values: np.ndarray, masked: Bool) -> F4:
     """Return points (n, 3) as float32, NaN where a coordinate is masked or not finite.
 
+    ``values`` and ``masked`` are (n, 3) or (h, w, 3).
+
     Raises
     ------
     ConfigError : the shape or the type is wrong, or the unit is not metres.

@@ -33,7 +33,8 @@ class Table:
     """A table of a run; reads the requested columns on demand.
 
     ``widths`` holds, for columns of equally long lists, the length of these lists. It is needed
-    if the table has no rows. ``work`` is the id of the run whose table may be read.
+    if the table has no rows. ``work`` is the id ``work`` in run.json: the table of a run with
+    another id is refused, unless ``work`` is empty.
     """
 
     path: Path

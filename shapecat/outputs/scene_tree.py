@@ -30,7 +30,7 @@ _CANDIDATE_COLUMNS = (
 
 
 def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str:
-    """Return the tree of planes and objects in a frame, indented, one per line.
+    """Return the tree of planes and objects in a frame, in the format of `format_tree`.
 
     As in the other outputs, merged tracks are one object, and deleted ones are left out.
 
