@@ -267,7 +267,7 @@ def _chosen(
 
 
 def thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFrame]:
-    """Yield every n-th frame of each topic."""
+    """Yield every n-th frame of each topic, starting with the first."""
     counts: Counter[str] = Counter()
     for frame in frames:
         if counts[frame.topic] % every == 0:

@@ -324,7 +324,7 @@ def _covers(new: Any, old: Any) -> bool:
 
 
 def _recordings_of(about: Mapping[str, Any]) -> set[str]:
-    """Return the digests of the recordings that were exported."""
+    """Return the digests of the recordings in ``about``, the content of an export.json."""
     source = about.get("input")
     single = [source.get("digest")] if isinstance(source, dict) else []
     return {str(digest) for digest in (*about.get("recordings", ()), *single)}
