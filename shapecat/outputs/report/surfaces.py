@@ -170,10 +170,10 @@ def _closed(nearness: F8) -> F8:
     return nearness
 
 
-def _smoothed(heights: F8, bare: Bool) -> F8:
+def _smoothed(nearness: F8, bare: Bool) -> F8:
     """Average each pixel (h, w), even an empty one (``bare``), with those nearby on the object."""
     weight: F8 = (~bare).astype(np.float64)
-    value: F8 = np.where(bare, 0.0, heights)
+    value: F8 = np.where(bare, 0.0, nearness)
     for _ in range(_PASSES):
         value, weight = _blurred(value * weight), _blurred(weight)
         value = np.divide(value, weight, out=np.zeros_like(value), where=weight > 0)
