@@ -89,7 +89,7 @@ def curve(rows: Sequence[Sequence[float]]) -> Iterable[rr.ComponentColumn]:
 
 
 def _times_of(at: Sequence[At]) -> list[rr.TimeColumn]:
-    """Return the columns of both timelines."""
+    """Return the columns of the timelines ``sensor_time`` and ``frame``."""
     stamps, indices = np.array(at, np.int64).T
     return [
         rr.TimeColumn("sensor_time", timestamp=stamps.astype("datetime64[ns]")),

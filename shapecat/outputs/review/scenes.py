@@ -91,7 +91,10 @@ def _first_seen(labelled: LabelledFrame) -> int:
 
 
 def _places(labelled: LabelledFrame, *, fixed: bool) -> dict[int, F8]:
-    """Return each track's position (3,), in the fixed frame if ``fixed`` and the pose is known."""
+    """Return each track's position (3,), metres, in the sensor frame.
+
+    If ``fixed`` and the pose is known, it is in the fixed frame.
+    """
     pose = labelled.fixed_from_sensor if fixed else None
     return {
         o.track: transform(pose or IDENTITY, (o.full or o.box).center) for o in labelled.objects

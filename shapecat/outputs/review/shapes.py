@@ -290,7 +290,7 @@ def _tint(category: str, white: float) -> tuple[int, int, int]:
 def _packed(
     objects: Sequence[LabelledObject | Sketch], *, alpha: int = 255, white: float = 0.0
 ) -> U4:
-    """Return the colours (n,) of objects, 0xRRGGBBAA, by category and mixed with white."""
+    """Return the colours (n,) of objects, 0xRRGGBBAA, by category; ``white`` is as in `_tint`."""
     tints = {category: _tint(category, white) for category in {o.category for o in objects}}
     numbers = {
         category: (red << 24) | (green << 16) | (blue << 8) | alpha
