@@ -171,7 +171,8 @@ def process(
     up : up direction: ``tf`` from transforms, ``imu`` from an accelerometer, or three numbers in
         the sensor frame; ``auto`` uses transforms, else an accelerometer, else the planes.
     fixed_frame : frame in which objects stand still, such as ``map``; None to choose one.
-    start_s, end_s : limits, seconds after the start of the recording; None for no limit.
+    start_s, end_s : limits, seconds after the start of the recording, ``end_s`` exclusive; None for
+        no limit.
     every : process every n-th frame.
     model : path of a model file; None for the model that comes with shapecat.
     config : path of a TOML file with settings.

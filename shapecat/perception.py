@@ -44,8 +44,8 @@ class PerceptionInput(NamedTuple):
     Attributes
     ----------
     up : (3,) up direction in the sensor frame, a unit vector; None to estimate it from planes.
-    earlier : frames to fuse with this one. Candidates contain only pixels that have depth in
-        ``frame`` itself.
+    earlier : frames to fuse with this one. Candidates keep only pixels at which ``frame`` itself
+        shows the same surface.
     pose : ``fixed_from_sensor``, None if it is unknown.
     colour : the colour image nearest in time, for masks; its pixels are not used.
     """
@@ -210,7 +210,7 @@ def _add_masks(given: PerceptionInput, perception: Perception) -> Perception:
 
 
 def _repeats_frame(now: PerceptionInput, then: PerceptionInput, range_m: float) -> bool:
-    """Return whether a frame shows the same as an earlier one, with the same up direction."""
+    """Return whether `shows_the_same` is true of two frames, and their up directions are equal."""
     if (now.up is None) != (then.up is None):
         return False
     if now.up is not None and then.up is not None and now.up @ then.up < _SAME_UP:
@@ -234,7 +234,7 @@ def _copy_for(frame: Frame, first: Perception) -> Perception:
 
 
 def _restrict_to(frame: Frame, perceived: Frame, perception: Perception) -> Perception:
-    """Remove from candidates found in ``perceived`` the pixels that ``frame`` does not confirm."""
+    """Restrict candidates found in ``perceived`` to what ``frame`` shows (`keep_same_surface`)."""
     if perceived is frame:
         return perception
     scene = keep_same_surface(perception.scene, frame, perceived)
@@ -307,7 +307,7 @@ def _add_full_box(
 def _categorize(
     candidates: Sequence[Candidate], shapes: Sequence[_Shape], categorizer: Categorizer
 ) -> list[Detection]:
-    """Categorize candidates in one call; the posterior is uniform for those without a surface."""
+    """Categorize candidates; those without a surface are unknown, with a uniform posterior."""
     if not shapes:
         return []
     begun = time.perf_counter()

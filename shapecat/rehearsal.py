@@ -121,7 +121,7 @@ def recognize_ball() -> str:
 
 
 def find_mask() -> int:
-    """Find the masks of a square on a registered and an unregistered image; return their area."""
+    """Return the area, pixels, of a square's masks on a registered and an unregistered image."""
     frame = _frame_of(np.full((480, 640), 0.7))
     v, u = np.mgrid[200:240, 300:340]
     square = (v * 640 + u).ravel().astype(np.uint32)
@@ -137,7 +137,9 @@ _REHEARSALS: tuple[Callable[[], object], ...] = (find_ball, recognize_ball)
 """Functions that compile the kernels when they are called. They share no kernel and take equally
 long, so that two processes can work at the same time."""
 _POLL_S = 0.1
+"""Interval between checks whether compilation, here or in another process, has finished."""
 _TELL_S = 10.0
+"""Interval between progress reports."""
 _STAGES = ("completion", "description", "detection", "learning", "reuse", "surface")
 """Folders with the kernels for depth images; those for colour images are in ``colour``."""
 
@@ -151,7 +153,8 @@ def rehearse() -> None:
 def compile_all(observe: Observer = ignore, *, cores: int = 2, colour: bool = False) -> float:
     """Compile missing kernels, if possible in other processes; return the duration in seconds.
 
-    If another call, here or in another process, is compiling them, wait for it.
+    If another call, here or in another process, is compiling them, wait for it. The duration is 0
+    if none is missing, or if machine code cannot be stored: then nothing is compiled.
 
     Parameters
     ----------
@@ -195,7 +198,10 @@ def compile_all(observe: Observer = ignore, *, cores: int = 2, colour: bool = Fa
 
 
 def _completion_marker(*, colour: bool) -> Path | None:
-    """Return the file that marks completion; None if machine code cannot be stored."""
+    """Return the path of a file that exists once all kernels are compiled, with or without colour.
+
+    The result is None if machine code cannot be stored.
+    """
     stages = (*_STAGES, "colour") if colour else _STAGES
     folders = [code_folder(Path(__file__).with_name(stage)) for stage in stages]
     names = [folder.name for folder in folders if folder is not None]
@@ -206,7 +212,7 @@ def _completion_marker(*, colour: bool) -> Path | None:
 
 
 def _reporter(observe: Observer) -> Callable[[str], None]:
-    """Return a function that reports the number of kernels, but only every ten seconds."""
+    """Return a function that reports a phase and the number of kernels, every ten seconds."""
     last = time.monotonic()
 
     def report(phase: str) -> None:

@@ -62,7 +62,7 @@ class Frame(Record):
     frame_from_sensor: Pose | None = None
 
     def __post_init__(self) -> None:
-        """Check that the frame has either points, or depth and a camera of the same size."""
+        """Make arrays contiguous; require either points, or depth and a camera of the same size."""
         for name in ("depth", "points"):  # kernels would be compiled again for strided arrays
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, np.asarray(value, np.float32, order="C"))

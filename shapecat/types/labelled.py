@@ -25,8 +25,9 @@ class LabelledObject(Record):
     height_m : height of the visible box's centre above the surface the object stands on; NaN if
         that is unknown.
     touches_border, occluded : as in `Candidate`.
-    detections : numbers of its detections in the frame; several if tracks were merged.
-    full : the box of the whole object, estimated from the track's views; None if unknown.
+    detections : numbers of its detections in the frame, from 0; several if tracks were merged.
+    full : the box of the whole object, sensor frame, estimated from the track's views; None if
+        unknown.
     """
 
     track: int

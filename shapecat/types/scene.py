@@ -21,8 +21,8 @@ __all__ = [
 CATEGORIES = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
 """The shape categories of the default model, in the order of its posteriors."""
 UNKNOWN = "unknown"
-"""The category of an object that fits none of the model's categories. Also the label of such an
-object, and its folder in a data set."""
+"""The category of an object that fits none of the model's categories; also a label that a person
+may give, and the name of the folder of such objects in a data set."""
 
 
 class Plane(Record):
