@@ -164,8 +164,8 @@ def union(masks: Sequence[Mask]) -> Mask:
 def _update_last_object(label: int, packed: int) -> int:
     """Return ``packed`` updated with the label of the next pixel.
 
-    ``packed`` describes the last object encountered: its label in the upper 16 bits, and below them
-    4 times its distance in pixels, plus 1 if a pixel of label 0 lies between.
+    ``packed`` describes the last object encountered: its label in the upper 16 bits, 0 if none, and
+    below them 4 times its distance in pixels, plus 1 if a pixel of label 0 lies between.
     """
     return label << 16 if label > 0 else (packed + 4) | (label == 0)
 

@@ -133,7 +133,7 @@ def _trace(inside: Bool, corners: I4, ends: I4) -> int:
 
 @kernel(inner=True)
 def _turn(du: int, dv: int, left: int, right: int) -> tuple[int, int]:
-    """Return the next direction: right if ``right`` is outside, left if both are inside, else on.
+    """Return the next direction: right if ``right`` is outside, left if both are inside, or ahead.
 
     The present direction is ``du``, ``dv``; ``left`` and ``right`` are the pixels ahead, 1 inside.
     """

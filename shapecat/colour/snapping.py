@@ -78,9 +78,10 @@ class _Match(NamedTuple):
 
 
 def _match(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> _Match:
-    """Return the pixels that match a mask; ``owners`` (h, w) is the number of each pixel's mask.
+    """Return the pixels that match mask ``number``, counted from 1.
 
-    ``pixels`` (h, w, 3) is the colour image; ``scale`` is as in `snapped`.
+    ``owners`` (h, w) holds the number of each pixel's mask, 0 where there is none; ``pixels``
+    (h, w, 3) is the colour image; ``scale`` is as in `snapped`.
     """
     band_px, radius = max(2.0, _BAND_PX * scale), max(3, round(_WINDOW_PX * scale))
     margin, (left, top, width, height) = int(band_px) + radius, mask.box

@@ -181,9 +181,9 @@ def _cover(projections: F4, labels: I4, half: float, size: tuple[int, int], boxe
 
     ``labels`` (n,) are those of the depth pixels, ``size`` is width and height of the image.
     Squares are (n, 4) left, top, right + 1, bottom + 1; zeros outside the image. ``boxes`` is set
-    to such a box around the squares of each label, (labels, 4). ``projections`` is from
-    `_project_pixels`; ``half`` is half the width of a depth pixel in colour pixels at equal
-    distance.
+    to such a box around the squares of each label, (labels, 4): (width, height, 0, 0) without any.
+    ``projections`` is from `_project_pixels`; ``half`` is half the width of a depth pixel in colour
+    pixels at equal distance.
     """
     nought, one = np.float32(0), np.float32(1)
     width, height = np.float32(size[0]), np.float32(size[1])
@@ -208,7 +208,8 @@ def _window(boxes: I4, margin: int, size: tuple[int, int]) -> tuple[int, int, in
     """Return left, top, right + 1, bottom + 1 of a window that encloses boxes with a margin.
 
     ``boxes`` (k, 4) are from `_cover`, ``size`` is width and height of the image. The boxes are
-    shifted into the window in place; empty boxes become zeros.
+    shifted into the window in place; empty boxes become zeros. If all are empty, so is the window,
+    and the result is zeros.
     """
     left, top, right, bottom = size[0], size[1], 0, 0
     for box in boxes:
@@ -270,7 +271,7 @@ def _nearest_surface(around: F4, corner: tuple[int, int], cell: int, shape: tupl
 
 @kernel(inner=True)
 def _hide(front: F4, cell: int, boxes: I4, nearest: F4, splat: I4) -> None:
-    """Set pixels in boxes to label 0 where another surface hides their object, or is all they show.
+    """Set to label 0 pixels in boxes that show another surface, in front of an object or alone.
 
     ``boxes`` are as in `splat_depth`; ``front`` is from `_nearest_surface`, with its ``cell``;
     ``splat`` (h, w) holds the labels, ``nearest`` (h, w) their inverse depth, 0 without a label.
