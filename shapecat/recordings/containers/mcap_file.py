@@ -267,4 +267,6 @@ _NONE = ("", "", b"")
 _KNOWN = {int(opcode) for opcode in Opcode} | set(range(128, 256))
 """Opcodes that cause no warning. The MCAP specification leaves 128 to 255 to applications."""
 _END = (Opcode.DATA_END, Opcode.FOOTER)
+"""Opcodes of the records that end the data."""
 _DEFINING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+"""Opcodes of the records whose content is also read outside chunks."""

@@ -17,7 +17,10 @@ _ENTRY = struct.Struct("<QQ")
 
 
 class IndexedMessage(NamedTuple):
-    """An index entry; ``place`` is the byte offset of the message in the decompressed chunk."""
+    """The index entry of a message.
+
+    ``log_time`` is in nanoseconds; ``place`` is the byte offset in the decompressed chunk.
+    """
 
     channel_id: int
     log_time: int

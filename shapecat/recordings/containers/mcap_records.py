@@ -36,8 +36,11 @@ __all__ = [
 MAGIC = b"\x89MCAP0\r\n"
 
 _HEAD = struct.Struct("<BQ")
+"""Head of a record: opcode, and length of its content in bytes."""
 _CHUNK = struct.Struct("<QQQII")
+"""Head of a chunk: start and end time, decompressed size, CRC, length of the compression's name."""
 _MESSAGE = struct.Struct("<HIQQ")
+"""Head of a message: channel id, sequence number, log time and publish time in nanoseconds."""
 _FREELY = 256 << 20
 """A chunk may claim a decompressed size of up to this many bytes, whatever its compressed size."""
 _RATIO = 1000

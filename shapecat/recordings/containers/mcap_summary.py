@@ -23,6 +23,7 @@ DAMAGED_INDEX = "the index is damaged: reading the file from beginning to end in
 """A warning for the user."""
 
 _FOOTER = 9 + 20
+"""Size of the footer record, bytes: its head and its content."""
 
 
 @dataclass

@@ -33,11 +33,13 @@ __all__ = [
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 5, 6, 7
+"""Opcodes of records."""
 
 _LENGTH = struct.Struct("<I")
 _LONG = struct.Struct("<Q")
 _TIME = struct.Struct("<II")
 _LONGEST_HEADER = 1 << 20
+"""Longest header that is read, bytes; a longer one counts as damaged."""
 _FREELY = 256 << 20
 """A chunk may have a decompressed size of up to this many bytes, whatever its compressed size."""
 _RATIO = 1000

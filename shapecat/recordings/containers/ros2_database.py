@@ -34,6 +34,7 @@ _LAST_NS = 2**63 - 1
 _OF_URLS = frozenset("%?#")
 """Characters in a path that the reader would interpret as parts of a URL."""
 _SCHEMAS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
+"""MCAP's name of each format of message definitions."""
 
 
 class DatabaseRecording(Recording):
