@@ -96,7 +96,7 @@ def _read_rvl(data: bytes) -> U2:
 
 @kernel(inner=True)
 def _number(words: Any, at: int) -> tuple[int, int]:
-    """Return the number at nibble `at`, and the index of the nibble after it, -1 if damaged."""
+    """Return the number at nibble ``at``, and the index of the nibble after it, -1 if damaged."""
     value, shift = 0, 0
     while at < 8 * words.size and shift < 30:
         nibble = int(words[at // 8] >> np.uint32(28 - 4 * (at % 8))) & 15
@@ -110,7 +110,7 @@ def _number(words: Any, at: int) -> tuple[int, int]:
 
 @kernel
 def _expand_rvl(words: Any, out: U2) -> bool:
-    """Decode RVL words into `out`, depth values (h * w,); return False if they are damaged.
+    """Decode RVL words (n,) into ``out``, depth values (h * w,); return False if they are damaged.
 
     Source: Wilson 2017, Fast Lossless Depth Image Compression, DecompressRVL.
     """

@@ -43,12 +43,17 @@ LIBRARY_ERRORS = (
 """Errors that decoding may raise on malformed definitions or data."""
 
 _MAX_DEFINITION = 1 << 20
+"""Longest definition of a message type that is parsed, bytes."""
 _MAX_UNROLLED = 4096
+"""Largest number of items in a fixed-size array of strings or messages."""
 _SEPARATOR = "=" * 80 + "\n"
+"""Line before each IDL definition in a schema that holds several."""
 
 
 def decode(message: Message, decoders: dict[tuple[str, str, bytes], Decoder]) -> Any:
     """Decode a message to an object with its fields as attributes; cache decoders in ``decoders``.
+
+    Foxglove messages get the fields of the corresponding ROS messages, see `as_ros`.
 
     Raises
     ------

@@ -11,6 +11,7 @@ from shapecat.types import Camera
 __all__ = ["cloud_points", "organized", "unorganized"]
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""NumPy type of each PointField datatype."""
 
 
 def cloud_points(message: Any) -> F4:

@@ -31,7 +31,7 @@ def message_class(descriptors: bytes, name: str) -> Any:
 
 
 def _add(pool: DescriptorPool, name: str, files: dict[str, Any]) -> None:
-    """Move a file from `files` to the pool, after the files that it depends on."""
+    """Move file ``name`` from ``files`` to the pool, after the files that it depends on."""
     file = files.pop(name)
     for needed in file.dependency:
         if needed in files:
