@@ -34,7 +34,9 @@ __all__ = [
 _FARTHEST_M = 1e9
 """Transforms with a larger translation are rejected as damaged."""
 _DEEPEST = 200
+"""A frame with more ancestors than this counts as being in a loop."""
 _FIXED = ("map", "odom", "world")
+"""Usual names of fixed frames, best first."""
 
 
 class TransformError(ShapecatError):
@@ -78,7 +80,7 @@ class TransformBuffer:
         self._replaced: set[str] = set()
 
     def forget(self, stamp_ns: int) -> None:
-        """Remove each frame's transforms before a stamp, except the last of these."""
+        """Remove each frame's transforms before a stamp (ns), as `TransformTrack.forget` does."""
         for track in self._tracks.values():
             track.forget(stamp_ns)
 

@@ -26,6 +26,7 @@ from shapecat.types import Pose
 __all__ = ["Extrinsics"]
 
 _DRIVER = "/extrinsics/depth_to_color"
+"""End of the topic on which the ROS driver of RealSense cameras publishes ``colour_from_depth``."""
 
 
 class Extrinsics:

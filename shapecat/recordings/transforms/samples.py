@@ -76,7 +76,7 @@ class TransformTrack:
         self._numbers = array("d")  # seven per sample
 
     def __getitem__(self, k: int) -> TransformSample:
-        """Return sample `k`, counted from 0."""
+        """Return sample ``k``, counted from 0."""
         x, y, z, *quaternion = self._numbers[7 * k : 7 * k + 7]
         return TransformSample(self._parents[k], (x, y, z), tuple(quaternion))
 
