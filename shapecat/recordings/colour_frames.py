@@ -188,7 +188,7 @@ class _Partner:
             self._images.popleft()
 
     def calibrate(self, message: Message) -> None:
-        """Update the lens if the calibration has changed."""
+        """Update the lens if the calibration has changed and is usable; count it if unreadable."""
         content = bytes(message.data[_STAMP_BYTES:])
         if content == self._calibration:
             return
@@ -304,7 +304,7 @@ class _Partner:
 
     @cached_property
     def _first_lens(self) -> LensCamera | None:
-        """The lens of the first calibration in the recording; None if there is none.
+        """The lens of the first calibration with intrinsics; None if there is no usable one.
 
         It serves images that precede all calibrations.
         """

@@ -94,9 +94,10 @@ def pair_colours(
 
     Returns
     -------
-    The colour stream of each depth topic that has one. If its ``info_topic`` is that of the depth
-    stream, it is replaced by None. If a depth stream has none, there is a warning for each topic of
-    colour that belongs to it, or of all if the recording has no colour stream, and cannot be read.
+    The colour stream of each depth topic that has one. Its ``info_topic`` is None if it would be
+    that of the depth stream. If a depth stream has no colour stream, there is a warning for each
+    unreadable colour topic that belongs to it, or, if the recording has no colour stream at all,
+    for every unreadable colour topic.
 
     Raises
     ------

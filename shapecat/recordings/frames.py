@@ -24,7 +24,8 @@ class FrameRange:
 
     Attributes
     ----------
-    start_s, end_s : log time from the start of the recording, seconds; None for no limit.
+    start_s, end_s : log time from the start of the recording, seconds, ``end_s`` exclusive; None
+        for no limit.
     every : keep every n-th message of a stream.
 
     Raises

@@ -76,7 +76,7 @@ class LookAhead:
             self._forget(before)
 
     def _read_from(self, log_time_ns: int) -> None:
-        """Restart reading at a log time (ns), and pass on the messages shortly after it."""
+        """Restart reading at a log time (ns), and pass on the next 10 s, or all if ``whole``."""
         start = None if self.whole else log_time_ns
         self._messages: Iterator[Message] = (
             self._recording.messages(self._topics, start_ns=start) if self._topics else iter(())

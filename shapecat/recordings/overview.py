@@ -18,7 +18,8 @@ def describe_recording(path: Path) -> dict[str, Any]:
     """Return a recording's path, kind, size, times, topics with their use, and warnings.
 
     The keys are ``path``, ``kind``, ``bytes``, ``start_ns`` (log time), ``seconds``, ``warnings``
-    and ``topics``. Each topic has ``name``, ``type``, ``encoding``, ``count`` and ``use``.
+    and ``topics``. Each topic has ``name``, ``type``, ``encoding``, ``count`` and ``use``,
+    which is empty for a topic that shapecat does not use.
 
     Raises
     ------

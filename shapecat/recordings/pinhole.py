@@ -34,7 +34,9 @@ _UNIT = 1
 _LARGEST_PX = 1e5
 """Largest plausible intrinsic parameter, pixels: a field of view of about half a degree."""
 _SAMPLES = 4096
+"""Approximate number of points that are sampled from a cloud."""
 _FEWEST = 100
+"""Minimum number of usable points; with fewer, no camera is fitted."""
 _SPREAD = 0.1
 """The samples must span this fraction of the width and height, or the fit is ill-conditioned."""
 

@@ -115,7 +115,8 @@ class Recording(ABC):
     def decode(self, message: Message) -> Any:
         """Return a message as an object with the fields of its type as attributes.
 
-        The definition of the type is read from the recording itself.
+        The definition of the type is read from the recording itself. Foxglove messages get the
+        fields of the corresponding ROS messages.
 
         Raises
         ------

@@ -42,7 +42,10 @@ def is_nearly_aligned(lens: LensCamera, camera: Camera | None) -> bool:
 
 
 def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> bool:
-    """Return whether the intrinsics differ by less than ``fraction`` of the image width."""
+    """Return whether the intrinsics differ by less than ``fraction`` of the image width.
+
+    The result is False without a camera.
+    """
     if camera is None:
         return False
     intrinsics, camera_intrinsics = ((c.fx, c.fy, c.cx, c.cy) for c in (lens.pinhole, camera))
@@ -52,7 +55,10 @@ def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> boo
 
 @lru_cache(maxsize=8)
 def _largest_offset_px(lens: LensCamera, camera: Camera | None) -> float:
-    """Return the largest distance, in x or y, from a pixel to where the lens images its ray."""
+    """Return the largest distance, in x or y, from a pixel to where the lens images its ray.
+
+    The result is 0 without a camera or without distortion.
+    """
     if camera is None or not lens.model:
         return 0.0
     pinhole = lens.pinhole

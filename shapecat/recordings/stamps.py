@@ -15,7 +15,7 @@ __all__ = ["Clock", "Estimates", "stamp_ns"]
 _EPOCH_NS = 946_684_800 * 10**9
 """1 January 2000: earlier stamps probably count from when the sensor was switched on."""
 _DIFFERENT_S = 0.3
-"""Smallest difference from the delay of another topic that is reported. Drivers' differ by less."""
+"""Smallest difference from the delay of another topic that is reported. Drivers differ by less."""
 _JUMP_NS = 10 * 10**9
 """Smallest change of the delay between stamp and log time that counts as a jump."""
 _COMPARED = 64
@@ -108,9 +108,9 @@ class Clock:
         return stamp
 
     def compare(self, topic: str, stamp: int, log_time: int) -> None:
-        """Compare the latest delay with that of a message on another topic, nanoseconds.
+        """Compare the latest delay with that of a message on another topic; times are nanoseconds.
 
-        There is none once this topic may have ended: in a slow simulation, delays grow.
+        Once this topic may have ended, nothing is compared: in a slow simulation, delays grow.
         """
         if self.last is None or self.delay is None:
             return
@@ -121,8 +121,9 @@ class Clock:
     def report(self, *, colour: bool = False) -> None:
         """Add warnings about suspicious stamps to the recording.
 
-        Simulated time is not suspicious if the recording has the clock of the simulation. Of the
-        stamps of ``colour`` images, only missing ones are, and those far from the other topic's.
+        Simulated time is not suspicious if the recording has the clock of the simulation. On a
+        topic of ``colour`` images, only two things are: missing stamps, and stamps far from those
+        of the topic in `compare`.
         """
         names = {"zero"} if colour else set(_TEXTS)
         if any(topic.type == _SIMULATED for topic in self.recording.topics):

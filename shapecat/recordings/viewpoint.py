@@ -15,6 +15,7 @@ _CLEAR = 1e-4
 """Maximum squared ratio of the two smallest singular values of the equations. It is near 1 for the
 points of a single plane, which many cameras fit."""
 _ROUNDS = 3
+"""Number of fits, each but the first without the outliers of the one before."""
 
 
 def find_viewpoint(points: F4, previous: PinholeFit | None) -> tuple[PinholeFit, Pose, F4] | None:
