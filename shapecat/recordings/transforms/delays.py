@@ -38,7 +38,7 @@ class Delays:
         return not any(self._delays)
 
     def at(self, log_times_ns: I4) -> F8:
-        """Return the delays interpolated at log times, both (n,), nanoseconds."""
+        """Return delays interpolated at log times, both (n,), ns; at least one must be known."""
         order = np.argsort(self._log_times, kind="stable")
         known = np.array(self._log_times)[order], np.array(self._delays)[order]
         return np.asarray(np.interp(log_times_ns, *known))

@@ -291,7 +291,7 @@ class PoseFinder:
 
 
 def _level_frames(frames: Sequence[str], sensor: str) -> list[str]:
-    """Return the frames with z up, best first; the sensor's own robot comes before others."""
+    """Return the frames with z up, best first; the robot of frame ``sensor`` precedes others."""
 
     def order(name: str) -> tuple[int, bool, bool]:
         robot = name.rpartition("/")[0]
