@@ -60,6 +60,11 @@ class Densities:
     blocks : range of each block in the descriptor.
     kernels : maximum number of Gaussians per category; each is centred on a view drawn at random.
 
+    Attributes
+    ----------
+    widths : bandwidth of each block.
+    mean, deviation : (blocks,) of the log densities of training views under their own category.
+
     Notes
     -----
     The bandwidth of a block is a multiple of the typical distance between nearest kernels. It

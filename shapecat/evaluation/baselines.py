@@ -41,8 +41,8 @@ def compare_learners(
     ----------
     test : test views; those labelled ``unknown`` are left out.
     train : training views. If None, use ``test`` in cross-validation by instance, in up to 5 folds.
-    categories : order of the posteriors. All views of a category without training views count as
-        wrong.
+    categories : all possible labels except *unknown*. All views of a category without training
+        views count as wrong.
     root : folder of the data set, which error messages name.
 
     Returns
@@ -156,7 +156,7 @@ def _learners() -> dict[str, tuple[_Learner, bool]]:
 
 
 def _learn_shapecat(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
-    """Train and test shapecat's classifier; unlike the baselines, it also learns unknown shapes."""
+    """Train shapecat's classifier, also on unknown shapes; return the posteriors of ``test``."""
     model = fit_views(train, train.where(np.zeros(0, np.int64)), seed=0)
     return _in_order(model.predict(test.descriptors).posteriors, model.categories, categories)
 

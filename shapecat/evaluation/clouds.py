@@ -19,6 +19,7 @@ __all__ = ["CloudFile", "read_pcd", "read_ply"]
 
 _LARGEST_FILE = 1 << 30
 _LARGEST_HEADER = 1 << 16
+"""Maximum sizes of a file and of its header, bytes."""
 _PLY_TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -56,7 +57,8 @@ def read_pcd(path: Path) -> CloudFile:
 
     Raises
     ------
-    RecordingError : the file cannot be read, or is not a complete PCD file with x, y and z.
+    RecordingError : the file cannot be read, is larger than 1 GB, or is not a complete PCD file
+        with x, y and z.
     """
     content = _content(path)
     try:
@@ -81,8 +83,8 @@ def read_ply(path: Path) -> CloudFile:
 
     Raises
     ------
-    RecordingError : the file cannot be read, or is not a complete PLY file whose first element is
-        the vertices.
+    RecordingError : the file cannot be read, is larger than 1 GB, or is not a complete PLY file
+        whose first element is the vertices.
     """
     content = _content(path)
     try:
@@ -105,7 +107,8 @@ def _content(path: Path) -> bytes:
 def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], _Layout]:
     """Return the words of each header line by its keyword, and the layout of the body.
 
-    Raise ValueError, as `_ply_header` and `_unpack_pcd` do, if the content is invalid.
+    If the content is invalid, this, `_ply_header` and `_unpack_pcd` raise an error that `read_pcd`
+    catches.
     """
     found = re.search(rb"^DATA +(\w+)\s*?\n", content[:_LARGEST_HEADER], re.MULTILINE)
     if not found:
@@ -167,7 +170,8 @@ def _xyz(body: bytes, layout: _Layout) -> F8:
 
     Raises
     ------
-    ValueError : the body has fewer points or other text, or the encoding or the number is invalid.
+    ValueError, KeyError, IndexError : the body has fewer points or other text, the points lack x, y
+        or z, or the encoding or the number is invalid.
     """
     if layout.encoding == "ascii":
         columns = _ascii_columns(layout.point)

@@ -22,6 +22,7 @@ __all__ = ["DAMAGED", "Dataset", "View", "estimate_eye", "read_dataset", "read_v
 
 _FARTHEST_M = 100.0
 _LARGEST_M = 5.0
+"""Maximum magnitude of a coordinate, and maximum extent of a view along an axis."""
 DAMAGED = (
     OSError,
     ValueError,
@@ -170,7 +171,7 @@ def _valid_eye(eye: F8 | None) -> F8 | None:
 
 
 def estimate_eye(points: F4) -> F8:
-    """Estimate the position of the sensor from a partial view, 1 m from its centre.
+    """Estimate the position of the sensor from a partial view, 1 m from the centre of the view.
 
     Seen from the sensor, no two points of a view have the same direction. Of 48 positions around
     the points, at 15 to 60 degrees of elevation, return the one from which the points cover the

@@ -22,6 +22,7 @@ __all__ = [
 ]
 
 _BINS = 15
+"""Number of bins of confidence, from 0 to 1."""
 
 
 class Bin(NamedTuple):
@@ -65,7 +66,10 @@ def recall(table: I4) -> F8:
 
 
 def balanced_accuracy(table: I4) -> float:
-    """Return the mean recall of the categories with views; ``table`` (c, c) is as for `recall`."""
+    """Return the mean recall of the categories with views; NaN without views.
+
+    ``table`` (c, c) is as for `recall`.
+    """
     shares = recall(table)
     return float(np.nanmean(shares)) if np.any(table) else float("nan")
 
@@ -73,7 +77,8 @@ def balanced_accuracy(table: I4) -> float:
 def calibration_curve(truth: I4, posteriors: F4) -> tuple[Bin, ...]:
     """Return the calibration curve: bins of equal width in confidence, without the empty ones.
 
-    ``truth`` (n,) are the columns of the true categories in ``posteriors`` (n, c).
+    The confidence of a view is its largest posterior. ``truth`` (n,) are the columns of the true
+    categories in ``posteriors`` (n, c).
     """
     confidence = np.asarray(posteriors, np.float64).max(axis=1, initial=0.0)
     right = np.asarray(posteriors).argmax(axis=1) == truth if len(truth) else np.zeros(0, bool)
@@ -86,9 +91,10 @@ def calibration_curve(truth: I4, posteriors: F4) -> tuple[Bin, ...]:
 
 
 def expected_calibration_error(truth: I4, posteriors: F4) -> float:
-    """Return the mean absolute difference between confidence and accuracy over bins of confidence.
+    """Return the mean absolute difference between confidence and accuracy of the bins.
 
-    ``truth`` and ``posteriors`` are as for `calibration_curve`. The result is NaN without views.
+    Bins are weighted by their numbers of views. ``truth`` and ``posteriors`` are as for
+    `calibration_curve`. The result is NaN without views.
 
     Source: Naeini et al. 2015; Guo et al. 2017, eq. 3.
     """

@@ -29,7 +29,9 @@ __all__ = [
 _CELL = 46
 _MARGIN = 74
 _LETTER = 7
+"""Sizes in the confusion matrix, pixels: of a cell, the least margin, and the width of a letter."""
 _INK = (31, 78, 121)
+"""Colour of the pictures, RGB."""
 _STYLE = (
     "body{font:15px/1.5 system-ui,sans-serif;max-width:52em;margin:2em auto;padding:0 1em}"
     "table{border-collapse:collapse;margin:1em 0}td,th{padding:.15em .8em;text-align:right}"

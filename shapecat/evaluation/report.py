@@ -41,9 +41,11 @@ Ranges: TypeAlias = tuple[tuple[str, int, float], ...]
 
 _ELEVATIONS = (-math.inf, 15.0, 30.0, 45.0, 60.0, math.inf)
 _DISTANCES_M = (0.0, 0.8, 1.1, 1.4, 1.7, math.inf)
+"""Edges of the ranges of elevation, degrees, and of distance."""
 _WIDEST = 1_000_000
 """Width of a table in characters: enough for the maximum number of categories with long names."""
 _POINTS = (0, 60, 120, 250, 500, 1000, math.inf)
+"""Edges of the ranges of the number of voxels."""
 
 
 class Compared(NamedTuple):
@@ -197,7 +199,7 @@ def _novelty_figures(unknown: F4, known: F4) -> dict[str, float | None]:
 
 
 def _accuracy_over(values: np.ndarray, right: I4, edges: Sequence[float], unit: str) -> Ranges:
-    """Return (range, views, accuracy) for each range between ``edges`` that has views.
+    """Return (range, views, accuracy) for each range [low, high) between ``edges`` that has views.
 
     ``values`` (n,) is the quantity of each view, in ``unit``; ``right`` (n,) is whether its
     category is right.

@@ -45,10 +45,11 @@ def train_on_folder(
 
     Returns
     -------
-    Plain values: ``views``, ``skipped``, ``lost`` (folders of categories without a usable view),
-    ``off_support`` (categories whose objects, in most views, do not stand at z = 0),
-    ``categories``, ``model`` (its id), ``calibrated`` (whether enough instances were held out to
-    fit the temperature), and ``held_out`` (the report on these instances).
+    Plain values: ``views`` and ``skipped`` (number of views used, and of those with too few points
+    for a surface), ``lost`` (folders of categories without a usable view), ``off_support``
+    (categories whose objects, in most views, do not stand at z = 0), ``categories``, ``model`` (its
+    id), ``calibrated`` (whether enough instances were held out to fit the temperature), and
+    ``held_out`` (the report on these instances).
 
     Raises
     ------
@@ -133,7 +134,9 @@ def learn_on_folder(
 def fit_views(
     train: DescribedViews, held_out: DescribedViews, *, seed: int, **choices: Any
 ) -> Categorizer:
-    """Train a model on described views; ``choices`` are fields of `LearningSettings`.
+    """Train a model on described views, and calibrate it on the ``held_out`` ones, if any.
+
+    ``choices`` are fields of `LearningSettings`.
 
     Raises
     ------
@@ -153,7 +156,7 @@ def split_instances(labels: np.ndarray, instances: np.ndarray, rng: np.random.Ge
     """Return the mask (n,) of views to hold out: all views of a fifth of each label's instances.
 
     At least one instance of each label is held out and at least one is kept; a label with a single
-    instance keeps it.
+    instance keeps it. ``labels`` and ``instances`` (n,) are as in `DescribedViews`.
     """
     held_out = np.zeros(len(labels), bool)
     for label in np.unique(labels):

@@ -81,7 +81,7 @@ def describe_views(
     settings: Settings,
     with_functions: bool = False,
 ) -> DescribedViews:
-    """Describe each view; the generator of view k, counted from 1, has the seed (settings.seed, k).
+    """Describe each view; the random generator of view k, from 1, has the seed (settings.seed, k).
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ from shapecat.types import UNKNOWN, Frame
 
 __all__ = ["Comparison", "compare"]
 
-_PICTURES = 12
+_PICTURES = 12  # maximum number: one for each of as many equal parts of the run
 _DOUBTFUL = 0.1
 """If a smaller fraction of the objects matches, the reference may be from another recording."""
 

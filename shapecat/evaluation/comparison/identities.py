@@ -12,7 +12,9 @@ from shapecat.arrays import F8, I4, Bool
 __all__ = ["FrameIdentities", "Identities", "compute_tracking_metrics"]
 
 _ALPHAS = np.arange(0.05, 0.99, 0.05)
+"""Thresholds of similarity over which HOTA is averaged."""
 _FORBIDDEN = 1e6
+"""Cost of a pair that may not match."""
 
 
 class FrameIdentities(NamedTuple):
@@ -30,7 +32,10 @@ class FrameIdentities(NamedTuple):
 
 
 class Identities(NamedTuple):
-    """Tracking metrics over all frames; NaN if they are undefined."""
+    """Tracking metrics over all frames; NaN if they are undefined.
+
+    ``objects`` is the number of true objects, summed over the frames.
+    """
 
     idf1: float
     mota: float
@@ -154,7 +159,10 @@ def _idf1(occurrences: _Occurrences, threshold: float) -> float:
 
 
 def _hota(occurrences: _Occurrences) -> tuple[float, float, float]:
-    """Return HOTA, detection accuracy and association accuracy, averaged over thresholds."""
+    """Return HOTA, detection accuracy and association accuracy, averaged over thresholds.
+
+    They are NaN without true objects, and 0 if nothing was found.
+    """
     if not (occurrences.true.sum() and occurrences.found.sum()):
         return (0.0, 0.0, 0.0) if occurrences.true.sum() else (float("nan"),) * 3
     alignment = _alignment(occurrences)

@@ -30,7 +30,7 @@ hidden sides are estimates (SUN RGB-D, Song 2015)."""
 
 
 class Difference(NamedTuple):
-    """A row of the table: a true object and the detection matched to it, or one without the other.
+    """A row of objects.parquet: a true object and its matched detection, or one without the other.
 
     Attributes
     ----------

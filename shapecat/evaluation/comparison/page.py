@@ -31,6 +31,7 @@ __all__ = [
 ]
 
 _MOST_ROWS = 500
+"""Maximum number of differences that the page lists."""
 _LETTERS = 43
 """Width of a picture divided by the height of its letters."""
 _LETTER_WIDTH, _LINE = 0.62, 1.15
@@ -92,7 +93,7 @@ _Row = tuple[str, str, str]
 
 
 def figure_rows(found: Comparison) -> list[_Row]:
-    """Return name, value and meaning of each metric that could be computed."""
+    """Return name, value and explanation of each metric; undefined ones are left out, or ``–``."""
     figures, rows = found.figures, list[_Row]()
     frames, objects, category = (figures[n] for n in ("frames", "objects", "category"))
     detections = plural(objects["detections"], "detection")
@@ -193,7 +194,7 @@ _HEAD = ("frame", "difference", "true", "found", "track", "confidence", "overlap
 
 
 def _confidence(row: Difference) -> str:
-    """Return the confidence as text; it is empty for an unknown object, as in captions."""
+    """Return the confidence as text; empty for an unknown object, and without a detection."""
     if row.confidence is None or row.category == UNKNOWN:
         return ""
     return confidence_text(row.confidence)

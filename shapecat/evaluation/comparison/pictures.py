@@ -16,6 +16,7 @@ from shapecat.types import Frame
 __all__ = ["COLOURS", "DifferenceImage", "draw_frame", "words_of"]
 
 _SHADES = 48
+"""Number of shades of grey."""
 COLOURS = {
     "both": (66, 160, 71),
     "missed": (230, 81, 0),
@@ -25,6 +26,7 @@ COLOURS = {
 """Colours of the pixels of objects: the same in run and truth, only in the truth, only in the run,
 and in both but with different categories."""
 _INK = 0.55
+"""Opacity of the colours over the grey, from 0 to 1."""
 
 
 class Caption(NamedTuple):
@@ -117,7 +119,7 @@ def _states(
 def _shades(frame: Frame | None, height: int, width: int) -> U1:
     """Return the grey level (n,) of each pixel, from 0 to `_SHADES` - 1.
 
-    Surfaces are lit from the camera; nearer ones are brighter.
+    Surfaces are lit from the camera; nearer ones are brighter. Without depth, all are alike.
     """
     if frame is None or frame.depth is None:
         return np.full(height * width, _SHADES * 3 // 4)

@@ -22,6 +22,7 @@ from shapecat.evaluation.comparison.labellings import (
 __all__ = ["CocoLabels", "filled_polygon"]
 
 _MOST_PIXELS = 50_000_000
+"""Maximum number of pixels of an image."""
 _A_STAMP = 10**17
 """A larger number in an image name is a timestamp in nanoseconds; a smaller one is a frame number
 or a date. The longest dates, with milliseconds, have 17 digits."""
