@@ -19,6 +19,7 @@ _COLUMNS, _ROWS = 0.08, 0.5
 """Fractions of the features and of the views that are drawn at random for each tree."""
 _FEWEST_COLUMNS = 10
 _FEWEST_ROWS = 100
+"""Minimum numbers of features and views that are drawn, or all if there are fewer."""
 
 
 class BoostedEnsemble(NamedTuple):

@@ -19,6 +19,7 @@ __all__ = ["BINS", "Bins", "Tree", "TreeSettings", "grow_tree", "joined", "make_
 BINS = 64
 """Number of quantile bins of each feature."""
 _LEAST_GAIN = 1e-6
+"""A leaf is split only if the gain is larger."""
 
 
 class TreeSettings(NamedTuple):

@@ -24,7 +24,8 @@ class FlatForest(Record):
 
     Raises
     ------
-    ValueError : a child does not come after its parent, lies beyond the end, or has two parents.
+    ValueError : there is no tree, or a child does not come after its parent, lies beyond the end,
+        or has two parents.
     """
 
     roots: U4 = array("t", "u4")

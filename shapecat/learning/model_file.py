@@ -29,6 +29,7 @@ _FORMAT = "shapecat-model"
 _VERSION = 3
 _LARGEST_FILE = 64 << 20
 _LARGEST_PART = 128 << 20
+"""Maximum sizes of a file, and of all its unpacked members together, bytes."""
 _HEADER = "header.json"
 
 
@@ -64,11 +65,11 @@ def save_model(path: Path, categorizer: Categorizer) -> None:
 
 
 def require_model_path(path: Path, *, overwrite: bool = True) -> None:
-    """Check that a model can be written to a path, and would replace nothing but a model.
+    """Check that a model can be written to a path, and replaces at most a model or an empty file.
 
     Raises
     ------
-    OutputError : the model cannot be written, or the file exists and is not a model, or it is a
+    OutputError : the model cannot be written, or the file is neither empty nor a model, or it is a
         model and ``overwrite`` is false.
     """
     require_writable(path)
