@@ -1,4 +1,4 @@
-"""Measure the stages and print Markdown tables."""
+"""Benchmark detection, its ablation, and the stages; print Markdown tables."""
 
 import os
 
@@ -10,7 +10,7 @@ from benchmarks.measure import machine  # noqa: E402
 
 
 def main() -> None:
-    """Run all benchmarks."""
+    """Run the benchmarks."""
     print(f"# Benchmarks\n\n{machine()}\n")
     print(detection.run(15))
     print(ablation.run(30))

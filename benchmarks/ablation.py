@@ -54,7 +54,7 @@ def without(*steps: str) -> Iterator[None]:
 
 
 def run(count: int, first_seed: int = 500) -> str:
-    """Score every set of steps on the same frames; return a Markdown table."""
+    """Score every set of steps on ``count`` simulated frames and the real ones; return a table."""
     sets = labelled_sets(count, first_seed)
     rows = []
     for method, finder, left_out in _methods():
@@ -77,7 +77,7 @@ def _methods() -> Iterator[tuple[str, Finder, list[str]]]:
 
 
 def _clusters(frame: Frame) -> list[Array]:
-    """Find the largest horizontal plane and cluster the points above it by distance alone."""
+    """Find the largest horizontal plane; cluster the points above it by distance; a `Finder`."""
     import open3d as o3d  # noqa: PLC0415  heavy
 
     points = frame.xyz().astype(np.float64)

@@ -122,7 +122,7 @@ def matches(
     """Match true and found objects one to one by their pixels; yield the pairs.
 
     ``objects`` are from the truth and ``rows`` from the detections of one frame; ``labels`` (h, w)
-    are its true pixel labels. Pairs need an IoU of `SAME` and `SEEN_PIXELS` true pixels.
+    are its true pixel labels. Pairs need an IoU of at least `SAME`, and `SEEN_PIXELS` true pixels.
     """
     inside = [np.bincount(labels.reshape(-1)[r["indices"]], minlength=256) for r in rows]
     iou = np.zeros((len(objects), len(rows)))

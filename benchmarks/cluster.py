@@ -83,10 +83,9 @@ class Queue:
 def simulate(workers: int, costs: Measured, given: Assumed) -> dict[str, float]:
     """Return the hours, the efficiency, and the utilization of each shared resource.
 
-    All but the hours are fractions.
-
-    Recordings are sent out largest first. Each one queues for the scheduler, for reading from the
-    storage, for its worker's core, for writing to the storage, and for the manifest.
+    All but the hours are fractions; the last one is of planning. Recordings are sent out largest
+    first. Each one queues for the scheduler, for reading from the storage, for its worker's core,
+    for writing to the storage, and for the manifest.
     """
     rng = np.random.default_rng(0)
     frames = rng.lognormal(math.log(given.median_frames), given.spread, given.recordings)
@@ -157,7 +156,7 @@ def measure(frame_s: float) -> Measured:
 
 
 def draw(path: Path, results: dict[str, list[dict[str, float]]]) -> None:
-    """Draw hours and efficiency over workers."""
+    """Draw hours and efficiency over workers; ``results`` are those of `simulate`, by case."""
     import matplotlib as mpl  # noqa: PLC0415  only here
 
     mpl.use("Agg")

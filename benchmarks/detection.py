@@ -21,11 +21,11 @@ ROUNDS = 8
 """Number of rounds, each with all methods, as the speed of a machine changes within seconds."""
 PCL = ("segmentation", "features", "filters", "sample_consensus", "search", "kdtree", "common")
 RANGE_M = 2.0
-"""Range of all methods, metres."""
+"""Maximum range of all methods, metres."""
 
 
 def run(count: int) -> str:
-    """Time every method on every frame; return a Markdown table."""
+    """Time every method on ``count`` simulated frames and on real ones; return a Markdown table."""
     sets = {
         "simulated clutter": [labelled.frame for labelled in labelled_clutter(count)],
         "real tables": list(real_tables(every=max(1, 45 // count))),

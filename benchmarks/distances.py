@@ -24,7 +24,7 @@ from shapecat.simulation.scenes.kinds import SceneKind
 KINDS: tuple[SceneKind, ...] = ("tabletop", "clutter", "pile")
 RANGES_M = ((0.3, 0.45), (0.45, 0.7), (0.7, 1.1), (1.1, 1.7), (1.7, 2.6))
 MARGIN_M = 0.05
-"""Sensors that can measure less than this much of a range, at its far end, are left out of it."""
+"""Sensors that measure less than this at the far end of a range are left out of it."""
 HEAD = ("distance, m", "frames", "objects", "found", "mean F", "surplus a frame")
 
 

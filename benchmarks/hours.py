@@ -29,10 +29,13 @@ from shapecat.runs.tracks import track_run
 from shapecat.types import CATEGORIES
 
 PER_HOUR, OBJECTS, PLACES_OF_FALSE = 100_000, 8, 8
+"""Frames per hour, number of objects, and number of places where false detections appear."""
 PERIOD_NS = 36_000_000
 NOISE_M = 0.004
+"""Standard deviation of measured positions and outlines."""
 OVERLOOKED, FALSE = 0.01, 0.002  # fractions: of missed detections; of frames with a new false one
 FALSE_FRAMES, VISIT_FRAMES, AWAY_FRAMES = 5, 10_000, 500
+"""Duration of a false detection; period in which an object is removed once, and for how long."""
 
 
 def make_tables(folder: Path, frames: int) -> None:

@@ -13,7 +13,7 @@ def cluster_above_plane(cloud: Any, up: Array) -> tuple[Array, Array]:
     Parameters
     ----------
     cloud : an Open3D point cloud, whose points are about a centimetre apart.
-    up : (3,) up direction in the frame of the cloud.
+    up : (3,) up direction in the frame of the cloud, which is the sensor frame.
 
     Returns
     -------

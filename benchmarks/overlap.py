@@ -27,7 +27,7 @@ def objects_in(frame: Frame) -> list[Array]:
 
 
 def score(frames: Sequence[Labelled], finder: Finder) -> dict[str, float]:
-    """Match objects one to one; return overlap F, the fraction found, and the number of objects."""
+    """Match objects one to one; return overlap F, the fraction with F >= 0.75, and their number."""
     total = Overlap()
     for frame, labels, objects in frames:
         masks = [np.flatnonzero(np.isin(labels, parts)) for parts in objects]

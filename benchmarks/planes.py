@@ -32,6 +32,7 @@ COVERED, SHOWN, SEEN = 0.8, 0.2, 0.01
 """Fraction of a covered table under boxes; fraction of the image filled by a cut table and its
 objects; least fraction of the image in which a covered table is visible between its boxes."""
 PREVIEW = Camera(80, 60, 65.6, 65.6, 39.5, 29.5)
+"""A Kinect at an eighth of its resolution, to see quickly what an image would show."""
 
 
 def covered(rng: Generator) -> World:

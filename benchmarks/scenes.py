@@ -41,9 +41,9 @@ def simulated_frame(kind: SceneKind, seed: int, sensor: Sensor) -> tuple[World, 
 
 
 def make_run(folder: Path, **options: Any) -> None:
-    """Simulate ``recording.mcap`` in a folder, and process it into ``run``, without its outputs.
+    """Simulate ``recording.mcap`` in a folder, and process it into ``run``, a folder beside it.
 
-    ``options`` are those of `simulate`.
+    annotated.mcap and review.rrd are not written; ``options`` are those of `simulate`.
     """
     source = simulate(folder / "recording.mcap", **options)
     process(Job(source, folder / "run", mcap=False, rrd=False))
@@ -61,7 +61,7 @@ def detected(frame: Frame) -> Scene:
 
 
 def real_tables(every: int = 1) -> Iterator[Frame]:
-    """Yield real Kinect frames of tables; none if the data are missing."""
+    """Yield one in ``every`` real Kinect frames of tables; none if the data are missing."""
     path = SHARED / "osd_learn" / "depth.mcap"
     if path.exists():
         with open_recording(path) as recording:

@@ -78,7 +78,8 @@ def measure_frame(depth: Array) -> Figures:
 def _roughness(inverse: Array, width: int) -> float:
     """Return the standard deviation of the inverse depth from planes in quiet windows, 1/m.
 
-    ``inverse`` (h, w) is 0 where there is no depth; a window is ``width`` pixels wide.
+    ``inverse`` (h, w) is 0 where there is no depth; a window is ``width`` pixels wide. The result
+    is NaN if no window has enough depth.
     """
     v, u = np.mgrid[:width, :width].reshape(2, -1) - width / 2
     design = np.column_stack([u, v, np.ones(width * width)])
@@ -96,7 +97,7 @@ def _roughness(inverse: Array, width: int) -> float:
 def _edge_width(depth: Array, width: int) -> float:
     """Return the mean number of pixels between the two sides of a depth step along rows.
 
-    ``depth`` (h, w) is in metres; the step is within ``width`` pixels.
+    ``depth`` (h, w) is in metres; a step is within ``width`` pixels. Without one, return NaN.
     """
     near, far = depth[:, : -width - 1], depth[:, width + 1 :]
     step = (near > 0) & (far > 0) & (np.abs(far - near) > JUMP_M)
@@ -139,7 +140,10 @@ def _frames(folder: Path) -> Iterator[Frame]:
 
 
 def _shaded(depth: Array, focal: float) -> Array:
-    """Return the brightness (h, w) of the surfaces of a depth image lit from the side."""
+    """Return the brightness (h, w) of a depth image lit from the side, NaN around missing depth.
+
+    ``depth`` (h, w) is in metres, ``focal`` the focal length in pixels.
+    """
     depth = np.where(depth > 0, depth, np.nan)
     down, right = np.gradient(depth)
     slopes = [np.arctan(step * focal / depth + tilt) for step, tilt in ((right, 0.5), (down, -0.6))]

@@ -39,6 +39,7 @@ RANGE_M = 2.0
 SAME = 0.5
 """Minimum IoU of the masks of a detection and the object that it matches."""
 VIEWS = (1, 3, 10, 30)
+"""Numbers of views to fuse."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +240,7 @@ def calibration(views: Iterable[View]) -> dict[int, dict[str, float]]:
 
 
 def evaluate(folder: Path, seeds: Iterable[int]) -> dict[str, Any]:
-    """Make, process and evaluate sequences of all kinds."""
+    """Make, process and evaluate sequences of all kinds; return the rows of each table by name."""
     seen: dict[str, list[FrameIdentities]] = {}
     views: list[View] = []
     for seed in seeds:
@@ -265,7 +266,7 @@ def evaluate(folder: Path, seeds: Iterable[int]) -> dict[str, Any]:
 
 
 def format_tables(figures: dict[str, Any]) -> str:
-    """Return the results as Markdown tables."""
+    """Return the results of `evaluate` as Markdown tables."""
     return "\n".join(
         markdown(title, [first, *next(iter(figures[key].values()))], rows)
         for title, key, first in (

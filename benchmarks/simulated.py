@@ -24,9 +24,11 @@ from shapecat.simulation.scenes.worlds import World
 from shapecat.types import Frame, Scene
 
 HIT_IOU = 0.5
+"""Minimum IoU of the masks of a candidate and the object that it matches."""
 SEEN_PLANE_PIXELS = 3000
 """Planes with fewer depth pixels on their upper face are not expected to be found."""
 SAME_HEIGHT_M = 0.03
+"""Maximum difference of the heights of a found plane and the true one."""
 FACE_M = 0.004
 """Points nearer than this to the height of a support, metres, count as its upper face."""
 COLUMNS = (
