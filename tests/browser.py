@@ -148,7 +148,7 @@ class Browser:
         self.console_messages()
 
     def wait(self, script: str) -> None:
-        """Wait until a script returns true."""
+        """Wait until a script returns true; fail after `_WAIT_S`."""
         deadline = time.monotonic() + _WAIT_S
         while time.monotonic() < deadline:
             if self.run(script) is True:

@@ -280,7 +280,7 @@ def reported_run(guessed_run: Path, drawn: Any, tmp_path_factory: pytest.TempPat
 
 @pytest.fixture(scope="module")
 def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Process a test file's recording without interruption; return the parent folder."""
+    """Process a test file's recording without interruption; return the parent folder of the run."""
     from shapecat.pipeline import process
     from shapecat.runs.jobs import Job
 

@@ -17,7 +17,7 @@ __all__ = ["FrameDetections", "frame", "gather", "track_frames"]
 class FrameDetections(Record):
     """The detections (n,) of one frame, which may have none; columns are as in `DetectionTable`.
 
-    There, ``detections`` are ``numbers``. If ``orientations`` is None, boxes are aligned with the
+    Its ``numbers`` are ``detections`` here. If ``orientations`` is None, boxes are aligned with the
     axes; if ``described`` is None, this frame described all.
     """
 

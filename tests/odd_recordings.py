@@ -36,7 +36,8 @@ FACTORY, FACTORY1 = MessageFactory(2), MessageFactory(1)
 class Case(NamedTuple):
     """A recording: its writer, and the expected exit code, number of frames, and messages.
 
-    ``reported`` is a part of the messages; if it is empty, there must be none.
+    ``write`` writes it into a folder and returns its path. ``reported`` is a part of the messages;
+    if it is empty, there must be none.
     """
 
     write: Callable[[Path], Path]
@@ -46,7 +47,7 @@ class Case(NamedTuple):
 
 
 def write_all(writer: Any, items: Iterable[tuple[str, str, int, bytes]], types: Any) -> None:
-    """Write serialized messages with a writer of rosbags."""
+    """Write topic, type, time (ns) and bytes of messages with a writer of rosbags."""
     connections: dict[str, Any] = {}
     with writer:
         for topic, kind, time, data in items:

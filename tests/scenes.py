@@ -18,8 +18,8 @@ from shapecat.types import Camera, Frame, Pose
 from tests.messages import EPOCH, SECOND
 
 OPTICAL = "camera_depth_optical_frame"
-STEP = 4
-PERIOD = SECOND // 30
+STEP = 4  # keeps every fourth row and column
+PERIOD = SECOND // 30  # ns
 
 
 class View(NamedTuple):

@@ -18,7 +18,7 @@ GROUPS = {"disk": ("enospc", "tmpfs", "erofs"), "io": ("eio", "eioread", "short"
 
 
 def main(words: list[str] | None = None) -> int:
-    """Run the cases; return 1 if an invariant failed."""
+    """Run the cases; return 1 if an invariant failed, or no case was judged."""
     options = _parse(words)
     scenarios = tuple(s for s in SCENARIOS if options.jobs in {None, s.jobs} or s.name == "single")
     with tempfile.TemporaryDirectory(prefix="shapecat-faults-") as store:

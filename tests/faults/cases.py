@@ -70,7 +70,7 @@ class FaultRunner:
         return _Reference(case, ended.seconds, calls)
 
     def draw(self, kind: str, rng: random.Random) -> Scenario:
-        """Choose a scenario in which a fault of this kind can happen."""
+        """Choose a scenario in which a fault of this kind can happen; else raise `SkippedError`."""
         fitting = [s for s in self.scenarios if _fits(kind, s)]
         if not fitting:
             msg = f"no scenario for {kind}"
@@ -78,7 +78,7 @@ class FaultRunner:
         return rng.choice(fitting)
 
     def judge(self, kind: str, seed: int) -> Verdict:
-        """Run a case, check it, run the same command again, and check that."""
+        """Run a case, check it, run the same command again, check that; may raise `SkippedError`."""
         rng = random.Random(f"{kind} {seed}")  # noqa: S311  draws moments, no secrets
         scenario = self.draw(kind, rng)
         case = self.store / "cases" / f"{kind}-{seed}-{time.monotonic_ns()}"

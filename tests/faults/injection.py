@@ -23,6 +23,7 @@ SIGNALS = {
     "kill": signal.SIGKILL,
 }
 COUNTERS = {"eioread": 0, "short": 0, "enospc": 1, "eio": 1, "erofs": 1, "clock": 2}
+"""Kinds of failing calls, each with the index of its counter in shim.c."""
 KINDS = (*SIGNALS, "worker", "replace", "tmpfs", *COUNTERS)
 LIMIT_S = 120.0
 """A command that takes longer hangs."""

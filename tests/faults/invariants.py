@@ -36,6 +36,7 @@ CODES = {
     "short": {0},
     "clock": {0},
 }
+"""Accepted exit codes by kind of fault."""
 _CRASH = re.compile(
     r"Traceback|SystemError|Segmentation fault|Fatal Python error|resource_tracker|core dumped"
     r"|Bus error|this is a bug|Exception ignored"
@@ -138,7 +139,7 @@ def complete_lines(manifest: Path) -> Iterator[str]:
 
 
 def nothing_lost(scenario: Scenario, ended: Ended, out: Path) -> Iterator[str]:
-    """Check that the frames reported some seconds before the end are still there."""
+    """Check that frames reported `RECENT_S` before the fault, or else the end, are still there."""
     last = ended.fault_s if ended.fault_s is not None else ended.seconds
     for name, count in reported(ended, last - RECENT_S).items():
         run = name.rpartition("/")[2].partition(".")[0]

@@ -228,7 +228,7 @@ def judge(mutant: Mutant, reached: Mapping[Path, Reached | None]) -> tuple[Mutan
 
 
 def main() -> int:
-    """Print the outcome of each mutant, and the fraction that was killed."""
+    """Print the outcome of each mutant, and the fraction killed; return 1 if that is too small."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, help="mutants, all if absent")
     parser.add_argument("--seed", type=int, default=1)

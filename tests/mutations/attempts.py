@@ -26,6 +26,7 @@ __all__ = ["ROOT", "Mutant", "Reached", "attempt", "reach"]
 
 ROOT = Path(__file__).parents[2]
 SLOWEST_S = 900.0
+"""Maximum duration of a test file without a mutant."""
 
 _FORK = multiprocessing.get_context("fork")
 
