@@ -78,7 +78,7 @@ class FaultRunner:
         return rng.choice(fitting)
 
     def judge(self, kind: str, seed: int) -> Verdict:
-        """Run a case, check it, run the same command again, check that; may raise `SkippedError`."""
+        """Run a case, check it, run the command again, check that; may raise `SkippedError`."""
         rng = random.Random(f"{kind} {seed}")  # noqa: S311  draws moments, no secrets
         scenario = self.draw(kind, rng)
         case = self.store / "cases" / f"{kind}-{seed}-{time.monotonic_ns()}"
