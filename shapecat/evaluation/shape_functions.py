@@ -7,6 +7,7 @@ from shapecat.arrays import F4
 __all__ = ["shape_functions"]
 
 _SAMPLES = 4096
+"""Number of random samples in each histogram."""
 
 
 def shape_functions(points: F4, rng: np.random.Generator) -> F4:

@@ -16,6 +16,7 @@ from shapecat.surface import reconstruct, thin
 __all__ = ["DescribedViews", "describe_view", "describe_views"]
 
 _NOT_ASKED = np.zeros(0)
+"""Value of a column that was not requested."""
 _NEAR_SUPPORT_M = 0.05
 """Maximum distance from z = 0 of the lowest visible point of an object that stands at z = 0."""
 

@@ -15,6 +15,7 @@ __all__ = ["BoostedEnsemble", "grow_ensemble"]
 
 _L2 = 2.0
 _MIN_HESSIAN = 1.0
+"""Values of `TreeSettings`."""
 _COLUMNS, _ROWS = 0.08, 0.5
 """Fractions of the features and of the views that are drawn at random for each tree."""
 _FEWEST_COLUMNS = 10
