@@ -33,9 +33,11 @@ ROUND = ("cup", "can", "bottle", "bowl", "plate", "ball")
 ALIKE = 0.05
 """Maximum relative difference of length and width of a round object without a yaw."""
 SCORED = ("cup", "can", "box", "bottle", "bowl", "ball")
+"""Categories whose mean overlap is printed for each group."""
 KINDS: tuple[SceneKind, ...] = ("tabletop", "pile")
 GROUPS = ("tabletop, upright", "tabletop, lying", "pile, upright", "pile, tilted")
 _HOW: dict[SceneKind, str] = {"tabletop": "lying", "pile": "tilted"}
+"""How objects that do not stand upright lie, by kind of scene."""
 FRAMES, RATE_HZ = 24, 8.0
 COLUMNS = ("objects", "views", "visible", "full, single view", "full, track")
 
