@@ -51,6 +51,7 @@ DETECTIONS = (
     "size",
 )
 PLANES = ("frame", "plane", "height_m", "area_m2", "normal", "offset")
+"""Columns of both tables that are compared."""
 
 
 class Scene(NamedTuple):

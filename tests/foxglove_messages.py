@@ -13,6 +13,7 @@ from tests.mcap_files import mcap_writer
 from tests.messages import EPOCH, SECOND
 
 DOUBLE, STRING, MESSAGE, RAW, ENUM, FIXED, INT64 = 1, 9, 11, 12, 14, 7, 3
+"""Types of fields, as in descriptor.proto."""
 
 
 class Field(NamedTuple):
@@ -83,6 +84,7 @@ LAYOUT = {
         5: field("rotation", MESSAGE, "foxglove.Quaternion"),
     },
 }
+"""Fields of each message by number."""
 
 
 def descriptors() -> bytes:

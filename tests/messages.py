@@ -12,8 +12,8 @@ from shapecat.types import Camera, Frame
 from tests.mcap_files import McapChannels, mcap_writer
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-SECOND = 10**9
-EPOCH = 1_700_000_000 * SECOND
+SECOND = 10**9  # ns
+EPOCH = 1_700_000_000 * SECOND  # ns since 1970
 CLOUD, IMAGE = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image"
 INFO, COMPRESSED = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/CompressedImage"
 CAMERA = Camera(64, 48, 60.0, 61.0, 31.2, 23.7)

@@ -43,6 +43,7 @@ LAST = ("tracking", "recordings", "simulation")
 """Boxes at the left and right end of their layers; the others are in alphabetical order."""
 HIDDEN = {"__init__", "__main__", "py"}
 _Position = tuple[float, float, float]
+"""Left edge, top and width of a box."""
 
 
 def imports() -> dict[str, set[str]]:
