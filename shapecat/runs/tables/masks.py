@@ -59,7 +59,7 @@ def read_nearest_masks(folder: Path) -> Iterator[tuple[Key, ImageMasks]]:
 
     Images are in the order in which they were recorded. Several frames share an image if there are
     fewer images than frames, or if several depth sensors share a colour camera. The masks have
-    boxes, but no run lengths.
+    boxes, but no run lengths. Without a table of masks, nothing is yielded.
 
     Raises
     ------

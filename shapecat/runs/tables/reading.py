@@ -1,7 +1,7 @@
 """Read the Parquet tables of a run folder.
 
 The row groups of all tables but ``tracks`` cover the same frames, so that these tables can be read
-side by side in constant memory.
+side by side in constant memory. A table that is missing or unreadable raises an `OutputError`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,7 +43,7 @@ __all__ = [
 PROCESS_AGAIN = "process the recording again"
 """The remedy in the messages about unreadable tables."""
 _NUMBERS = {"center", "size", "orientation", "posterior", *FULL_BOX}
-"""Columns whose numbers are finite."""
+"""Columns whose numbers must be finite."""
 _TUPLES = {"edges": 2, "neurons": 3, "outline": 3}
 """Columns with flat lists of items, and the number of values per item."""
 
@@ -246,7 +246,8 @@ def opened(
 
     Raises
     ------
-    OutputError : the table is missing or unreadable, or lacks one of the columns.
+    OutputError : the table is missing or unreadable, even if only the block notices it, or a column
+        is missing or has the wrong type.
     """
     try:
         with _open_parquet(path, read_dictionary) as file:

@@ -51,6 +51,7 @@ MAY_BE_NULL = (
 )
 """Columns with lists of fixed size that may be null."""
 BOX_WIDTH = sum(FULL_WIDTHS[name] for name in FULL_BOX)
+"""Number of values in `FULL_BOX`."""
 FRAME_COLUMNS = (("topic", pa.string()), ("frame", pa.int32()), ("stamp_ns", pa.int64()))
 """Columns that identify a frame: topic, number on that topic, and stamp."""
 

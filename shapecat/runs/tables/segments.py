@@ -34,8 +34,10 @@ __all__ = [
 GROUP_FRAMES = 32
 """Minimum number of frames in a row group."""
 _BALANCE = 4096
-"""In a table with more frames, row groups grow with the square root of the number of frames."""
+"""In a table of n frames, row groups have isqrt(n // `_BALANCE`) × `GROUP_FRAMES` frames, but at
+least `GROUP_FRAMES`."""
 SEGMENTS, REVISIONS = "segments", "revisions"
+"""Folders with the segments of *perceive* and *revise*, in the folder of the run."""
 
 
 def discard_segments(folder: Path) -> None:
@@ -61,6 +63,7 @@ def list_segments(place: Path) -> list[Path]:
 
 
 _Tables = dict[str, pa.Table]
+"""The tables of perceive, or parts of them for the same frames, by name."""
 
 
 def _read_tables(segment: Path) -> _Tables:
