@@ -38,6 +38,7 @@ __all__ = [
 ]
 
 PREVIOUS = "tracks.previous.csv"
+"""Name under which the last replaced table with labels is kept."""
 LOST = "tracks.previous-*.csv"
 """Pattern for the names of replaced tables with labels that could not be transferred. Later runs
 keep these tables."""

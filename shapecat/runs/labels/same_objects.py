@@ -69,6 +69,10 @@ def match_in_time(source: Path, target: Path, group: Group) -> Matches | None:
     ----------
     source, target : run folders of the same recording.
     group : returns the same number for tracks of the source that a person merged.
+
+    Raises
+    ------
+    OutputError : a table of a run is unreadable.
     """
     old, new = read_track_detections(source), read_track_detections(target)
     common = sorted(old.rows.keys() & new.rows.keys())
@@ -172,7 +176,8 @@ def match_in_place(
 
     Raises
     ------
-    OutputError : the fixed frames are missing or differ, or a row has no position.
+    OutputError : the fixed frames are missing or differ, a table of a run is unreadable, or a row
+        whose position is used has none.
     """
     _require_one_frame(source, target)
     new, _ = _standing(target)

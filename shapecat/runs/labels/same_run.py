@@ -1,4 +1,4 @@
-"""Check that a table of tracks belongs to a run, since each run numbers its objects differently."""
+"""Check that a table of tracks belongs to a run, since each run numbers its tracks differently."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -11,7 +11,7 @@ __all__ = ["require_same_run"]
 
 
 def require_same_run(path: Path, table: TrackTable, folder: Path, *, own: bool = True) -> None:
-    """Check that a table belongs to the run in ``folder``.
+    """Check that a table belongs to the run in ``folder``; without run.json there, accept any.
 
     Parameters
     ----------

@@ -41,7 +41,12 @@ class TrackDetections(NamedTuple):
 
 
 def read_track_detections(folder: Path) -> TrackDetections:
-    """Read the detections of the tracks of a run."""
+    """Read the detections of the tracks of a run.
+
+    Raises
+    ------
+    OutputError : the table of tracks is unreadable.
+    """
     columns = ["track", "topic", "frame", "stamp_ns", "detection", "center_fixed"]
     with opened(folder / "tracks.parquet", columns=columns) as file:
         table = file.read(columns=columns)

@@ -35,13 +35,15 @@ replaced."""
 _COLUMNS = ("track", "category", "label")
 """The columns that a table needs. ``category`` helps to detect tables of other runs."""
 _LARGEST_TABLE = 64 << 20
+"""Maximum size of a table, bytes."""
 
 
 @dataclass(frozen=True)
 class TrackRow:
     """A line of tracks.csv; ``line`` counts from 1, ``cells`` holds all columns as text.
 
-    ``confidence`` is NaN if its cell holds no number from 0 to 1.
+    ``confidence`` is NaN if its cell holds no number from 0 to 1. ``topic`` holds several names,
+    joined by spaces, if the track is in several topics.
     """
 
     line: int

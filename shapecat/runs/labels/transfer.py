@@ -24,6 +24,7 @@ __all__ = [
 ]
 
 IN_TIME, IN_PLACE = "frames in common", "places in other frames"
+"""`Transfer.by` if tracks were matched by `match_in_time` or `match_in_place`."""
 TABLE_ALONE = "places in the table alone"
 """`Transfer.by` if a table was given without its run, so that fixed frame and moved objects are
 unknown."""
