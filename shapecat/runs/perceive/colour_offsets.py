@@ -19,7 +19,7 @@ from shapecat.runs.tables.reading import keys_of, numbers, read_together
 __all__ = ["explain_colour_offsets"]
 
 _FAR_S = 0.25
-"""Within a longer time, objects may have moved."""
+"""Between images that are farther apart in time, objects may have moved."""
 _SHIFT_M = 0.01
 """Masks are displaced if objects move farther than this between the two images."""
 _UNEXPLAINED = 0.5

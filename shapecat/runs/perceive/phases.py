@@ -44,7 +44,11 @@ _Item = tuple[FrameRow, PerceptionInput]
 
 
 class Work(NamedTuple):
-    """A job with its open recording and streams, the folder of its tables, and its run.json."""
+    """A job with its open recording and streams, the folder of its tables, and its run.json.
+
+    ``colours`` holds the colour stream of each depth topic that has one; ``cores`` is the number of
+    processes that perceive frames.
+    """
 
     recording: Recording
     streams: tuple[Stream, ...]
@@ -109,7 +113,7 @@ def _explain_poses(work: Work, poses: PoseFinder) -> Iterator[str]:
 
 
 def revise(work: Work) -> None:
-    """Perceive again frames without a plane, or that disagree with the rest; rewrite the tables.
+    """Perceive again frames that have no plane or disagree with the rest; rewrite the tables.
 
     An up direction that the user gave is never revised. A frame keeps its first result if it shows
     neither a plane nor an object with the new up direction. The counts in ``work.run`` are updated.

@@ -58,9 +58,9 @@ def require_resumable(job: Job, planned: RunInfo, digest: Callable[[], str]) -> 
 def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]) -> RunInfo:
     """Continue the interrupted run in a folder, or clear the folder to begin anew.
 
-    The run is continued if its files are complete, and its settings, options, model, versions and
-    recording are those of ``planned``. If only settings of tracking or of outputs differ, just its
-    frames are kept.
+    The run is continued if its files are complete, and its settings, options (except the requested
+    outputs), model, versions and recording are those of ``planned``. If only settings of tracking
+    or of outputs differ, just its frames are kept.
 
     Parameters
     ----------
@@ -100,7 +100,8 @@ def take_over_frames(
     """Take over the perceived frames of a finished run that differs only in later phases.
 
     Its tables are linked or copied only if nothing but settings of tracking or outputs differs. If
-    nothing at all differs, ``planned`` is returned: the user wants everything computed again.
+    none of these settings differs, ``planned`` is returned: the user wants everything computed
+    again.
 
     Parameters
     ----------

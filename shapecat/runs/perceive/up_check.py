@@ -24,7 +24,7 @@ from shapecat.types import Frame
 __all__ = ["Oriented", "UpCheck"]
 
 _CONFIRMS_DEG = 15.0
-"""A plane confirms an up direction within this angle, as in `detect`."""
+"""A plane confirms an up direction within this angle, as in `estimate_up`."""
 _MISNAMED_DEG = 5.0
 """A plane confirms a `Misnaming` within this angle, since transforms of simulators are exact. A
 larger angle would also accept maps of visual SLAM with z forward, off by the camera's pitch."""

@@ -14,6 +14,7 @@ from shapecat.runs.tables.reading import keys_of, read_together
 __all__ = ["explain_up", "report_up"]
 
 _DISAGREE_DEG = 10
+"""A larger median angle between the given up directions and the planes causes a warning."""
 
 
 def report_up(poses: PoseFinder, folder: Path) -> dict[str, Any]:
