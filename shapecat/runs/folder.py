@@ -48,12 +48,14 @@ RUN_FILES = (
     *OUTPUTS,
     "run.json",
 )
+"""The files that commands write to a run folder; run.json is last."""
 _MADE = (
     "segments",
     "revisions",
     *(partial_path(Path(name)).name for name in RUN_FILES),
     *RUN_FILES,
 )
+"""The items that a run makes in its folder; the marker is last."""
 
 _OUTPUTS_LOCK = "tracks.parquet"
 """A file that a process locks while it writes outputs. No command replaces it in a finished run.
@@ -250,9 +252,10 @@ def writing_outputs(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def outputs_pending(folder: Path) -> Iterator[None]:
-    """Mark the outputs of a finished run as missing; after a kill, the next run writes them.
+    """Mark the outputs of a finished run as missing; after the block, the caller writes them.
 
-    After a `ShapecatError` in the block, which then has changed nothing, they count as written.
+    After a kill, the next run does. After a `ShapecatError` in the block, which then has changed
+    nothing, they count as written again.
     """
     run = read_run(folder)
     kept = {phase: s for phase, s in run["seconds"].items() if phase not in OUTPUTS}

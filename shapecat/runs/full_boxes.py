@@ -18,7 +18,7 @@ from shapecat.tracking import Track, view_weights
 
 __all__ = ["FullBoxes", "full_columns"]
 
-_BLOCK = 2**16
+_BLOCK = 2**16  # views whose boxes are transformed at once
 _WIDTH = sum(FULL_WIDTHS.values())
 _MOST_VIEWS = 1000
 """Maximum number of views from which the box of a track is fused, spread over its time span."""

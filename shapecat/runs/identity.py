@@ -59,7 +59,12 @@ def work_id(run: RunInfo) -> str:
 
 
 def file_stats(path: Path) -> Stats:
-    """Return name, size and times of each file of a recording, without reading the files."""
+    """Return name, size and times of each file of a recording, without reading the files.
+
+    Raises
+    ------
+    OSError : a file is missing or not accessible.
+    """
     stats = [(file.name, file.stat()) for file in input_files(path)]
     return [[name, s.st_size, s.st_mtime_ns, s.st_ctime_ns] for name, s in stats]
 

@@ -50,7 +50,8 @@ class Job:
 
     Attributes
     ----------
-    folder : where the results are written, ``DIR/NAME``.
+    source : path of the recording; unused while it is still at the URL ``origin``.
+    folder : where the results are written, ``OUT/NAME``.
     topics : depth topics; empty to choose one.
     up : ``auto``, ``tf``, ``imu``, or a vector ``X,Y,Z`` in the sensor frame.
     fixed_frame : name of the fixed frame; None to choose one.
@@ -61,7 +62,7 @@ class Job:
     mcap, rrd : whether to write annotated.mcap and review.rrd.
     overwrite : whether to replace results of another input, settings or model.
     discard_labels : whether to discard the labels of the replaced results.
-    origin : URL from which ``source`` was downloaded; empty if none.
+    origin : URL from which ``source`` is downloaded; empty if none.
     target : URL to which the results are uploaded; empty if none.
     input_key : changes with the content of the recording; empty if unknown.
     work_key : changes with the options, settings and model; empty if unknown.

@@ -64,6 +64,7 @@ _COLUMNS = (
     "touches_border",
     "occluded",
 )
+"""The columns of the detections table that the tracker needs."""
 _UNMOVED = ("numbers", "sizes", "posteriors", "novelties", "partial", "described")
 """Columns of `DetectionTable` that are the same in every coordinate frame."""
 
@@ -114,7 +115,7 @@ def _write(
 
 
 def _batches(tracks: Iterable[Track]) -> Iterator[list[Track]]:
-    """Yield batches of tracks: one long track, or several short ones."""
+    """Yield batches of tracks: one long track, or several short ones. The last may be empty."""
     batch: list[Track] = []
     for track in tracks:
         if len(track.frames) > _BATCH and batch:
@@ -129,7 +130,10 @@ def _batches(tracks: Iterable[Track]) -> Iterator[list[Track]]:
 
 
 def _parts(tracks: list[Track]) -> Iterator[tuple[list[Track], slice]]:
-    """Yield the tracks to write at once, and their rows. A long track is written in parts."""
+    """Yield the tracks to write at once, and their rows among those of all ``tracks``.
+
+    A long track is written in parts.
+    """
     if len(tracks) != 1:
         yield tracks, slice(None)
         return
@@ -196,7 +200,7 @@ def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
 
 
 def _turned(orientations: F4, turns: F8) -> F8:
-    """Return quaternions (n, 4), x y z w, turned by rotation matrices (n, 3, 3)."""
+    """Return orientations (n, 4), x y z w, rotated by rotation matrices (n, 3, 3)."""
     if not len(orientations):
         return np.zeros((0, 4))
     return np.asarray((Rotation.from_matrix(turns) * Rotation.from_quat(orientations)).as_quat())
