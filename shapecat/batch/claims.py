@@ -27,6 +27,7 @@ _HEARTBEAT_S = 10.0
 _STALE_S = 45.0
 """The owner of a claim that stays unchanged for this time is presumed dead."""
 _POLL_S = 1.0
+"""Time between two looks at the claim of another process."""
 
 
 def claim_name(folder: str) -> str:

@@ -118,7 +118,10 @@ def _size(info: Mapping[str, Any]) -> int:
 
 
 def _search_remote_folder(location: Location) -> Iterator[Source]:
-    """Yield the recordings and ROS 2 bag folders below a folder."""
+    """Yield the recordings and ROS 2 bag folders below a folder.
+
+    Hidden files, hidden folders and run folders are left out; compressed files are logged.
+    """
     files: list[Source] = []
     described, runs = set(), set()
     for url, info in location.walk():

@@ -52,7 +52,10 @@ class Ledger:
             self._write(some)
 
     def _is_recorded(self, entry: Entry, state: State) -> bool:
-        """Return whether the folder's last entry has this state and the command of ``entry``."""
+        """Return whether the last entry of the folder of ``entry`` has this state.
+
+        It must also have the same input, work and command.
+        """
         last = self._manifest.entries.get(entry.folder)
         return last is not None and last.state == state and last.same_command(entry)
 

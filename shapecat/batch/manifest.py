@@ -41,6 +41,7 @@ _BEGIN = b'{"folder": "'
 """The first bytes of each line."""
 _PART_FOLDER = ".manifest"
 _PART_BYTES = 2**20
+"""A writer begins a new part when the last one holds this much."""
 _MOST_WAITING_BYTES = 8 * 2**20
 """Lines are sent immediately when more bytes than this are waiting."""
 _SEND_S = 5.0

@@ -30,6 +30,7 @@ from shapecat.system.files import partial_path
 __all__ = ["Batch", "Status", "Task", "parse_shard", "plan_batch", "run_of", "shard_of"]
 
 _NamedSource = tuple[str, Source]
+"""The name of a run folder, and its recording."""
 
 _THREADS = 16
 """Threads that check files: on a network disk each check is a round trip."""
@@ -113,7 +114,10 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 
 def shard_of(named: Sequence[_NamedSource], index: int, count: int) -> list[_NamedSource]:
-    """Return a shard of the recordings; the shards are disjoint, and together cover the list."""
+    """Return shard ``index``, from 0, of ``count`` disjoint shards that together cover the list.
+
+    It is sorted by run folder.
+    """
     return sorted(named, key=lambda pair: pair[0])[index::count]
 
 

@@ -39,7 +39,7 @@ _TRANSIENT_NAMES = {"ClientPayloadError", "ServerDisconnectedError"}
 """Errors of aiohttp by name, since it need not be installed."""
 _PAGE = 1000
 """Names per page of a listing, the most that S3 returns."""
-_PART_BYTES = 16 * 2**20
+_PART_BYTES = 16 * 2**20  # smallest part of a multipart upload
 _MOST_PARTS = 9_000
 """Largest number of parts of a multipart upload; S3 allows 10,000."""
 
