@@ -42,7 +42,7 @@ _NO_VAL = (
     "--per-track",
     type=click.IntRange(0),
     default=0,
-    help="coco, yolo: keep only the frames with N views of each track that differ most; 0, the "
+    help="coco, yolo: keep only the frames with the N most different views of each track; 0, the "
     "default, keeps all.",
     metavar="N",
 )

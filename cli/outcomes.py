@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from shapecat.runs.jobs import Job, Summary
 
 _MOST_ROWS = 100
+"""Maximum number of recordings in the table at the end; with more, there is no table."""
 _THREADS = 16
 """Number of threads that read complete runs; at a URL, each run takes a round trip."""
 

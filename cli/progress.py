@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 _LINE_S = 5.0
 _EVENT_S = 0.5
+"""Shortest time between two lines of plain progress, and between two events of a recording."""
 _MOST_WARNINGS = 3
 """At most this many warnings about a recording are printed."""
 _STATUS_WORDS: "dict[Status, str]" = {

@@ -26,6 +26,7 @@ PHASES = {
     "evaluate": "evaluating",
     "compare": "comparing",
 }
+"""What progress displays call each phase."""
 
 _WIDEST = 100_000
 """Width, in characters, of tables for a file or another program; their lines are not folded."""
