@@ -23,9 +23,12 @@ __all__ = [
 ]
 
 RINGS, BANDS = 3, 4
+"""Numbers of intervals of the mean geodesic distance to the other neurons, and of the height."""
 DISTANCE_BINS = 12
 SHAPE_BINS, CURVED_BINS, MEAN_BINS = 8, 6, 6
+"""Numbers of bins for the shape index, the curvedness and the mean curvature."""
 UP_BINS = 8
+"""Number of bins for the normals' z."""
 
 
 def _bins(name: str, count: int) -> Iterator[str]:
@@ -58,8 +61,10 @@ _BLOCK_NAMES: dict[str, tuple[str, ...]] = {
     "revolution": REVOLUTION_NAMES,
     "solids": SOLID_NAMES,
     "outline": OUTLINE_NAMES,
+    # Metres; ``low`` is the height of the bottom above the support, ``wide`` the largest width,
+    # ``across`` and ``along`` are relative to the line of sight, ``spacing`` is between neurons.
     "metric": ("height", "low", "wide", "across", "along", "spacing"),
-    "view": ("elevation", "distance"),
+    "view": ("elevation", "distance"),  # of the sensor from the object: sine, metres
 }
 
 

@@ -11,18 +11,18 @@ from shapecat.jit import kernel
 __all__ = ["CONTEXT_NAMES", "context"]
 
 CONTEXT_NAMES = (
-    "height_to_across",
-    "along_to_across",
+    "height_to_across",  # a_to_b of two lengths is `_ratio`: a / (a + b)
+    "along_to_across",  # widths along and across the line of sight
     "height_to_widest",
-    "narrow_to_wide",
+    "narrow_to_wide",  # smallest, mean and largest horizontal width
     "mean_to_wide",
-    "spread_2_to_1",
+    "spread_2_to_1",  # variance along the second principal axis of the neurons / the first
     "spread_3_to_1",
-    "spread_1_vertical",
+    "spread_1_vertical",  # absolute cosine between the first axis and up
     "spread_3_vertical",
-    "normal_spread_2",
+    "normal_spread_2",  # second and third eigenvalue of the normals' second moments
     "normal_spread_3",
-    "normal_axis_vertical",
+    "normal_axis_vertical",  # absolute cosine between the third eigenvector and up
     "yaw_harmonic_1",
     "yaw_harmonic_2",
     "yaw_harmonic_4",
@@ -31,18 +31,18 @@ CONTEXT_NAMES = (
     "share_down",
     "share_up_top",
     "share_up_bottom",
-    "axis_radius",
-    "axis_radius_spread",
-    "axis_residual",
-    "axis_inward",
-    "axis_inward_top",
+    "axis_radius",  # `_ratio` of the mean radius about the vertical axis to the height
+    "axis_radius_spread",  # standard deviation of the radius / mean radius
+    "axis_residual",  # `VerticalAxis.residual` / mean radius
+    "axis_inward",  # fraction of the points that face the axis
+    "axis_inward_top",  # the same in the upper and in the lower half
     "axis_inward_bottom",
-    "axis_radius_top",
+    "axis_radius_top",  # `_ratio` of the mean radius of each half to that of the whole
     "axis_radius_bottom",
-    "axis_radius_slope",
-    "sphere_residual",
-    "sphere_radius",
-    "sphere_height",
+    "axis_radius_slope",  # change of the radius from bottom to top / mean radius, by regression
+    "sphere_residual",  # standard deviation of the distance from the centre / radius
+    "sphere_radius",  # 1 / (1 + radius)
+    "sphere_height",  # height of the centre: 0 at the bottom, 1 at the top
     "height_mean",
     "height_deviation",
     "height_skew",
@@ -50,9 +50,9 @@ CONTEXT_NAMES = (
     "geodesic_to_straight",
     "geodesic_longest",
     "geodesic_spread",
-    "base_gap",
+    "base_gap",  # `_ratio` of the gap above the support to the height
 )
-_DIRECTIONS = 16
+_DIRECTIONS = 16  # in which the horizontal width is measured, over 180 degrees
 
 
 @kernel(inner=True)

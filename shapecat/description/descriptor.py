@@ -29,6 +29,7 @@ _REACH = 3 * _GRID_SPACING
 """Maximum distance of a point from its nearest neuron, in mean gaps between neurons; farther points
 are ignored."""
 _FAR = 1e6
+"""Largest coordinate of a point or the sensor, in mean distances between neurons."""
 
 
 # kernels read numbers, not dictionaries

@@ -21,7 +21,7 @@ __all__ = ["distributions"]
 
 _DISTANCE_RANGE = 2.6
 """End of the distance histograms, in mean distances between neurons."""
-_CURVATURE = SHAPE_BINS + CURVED_BINS + MEAN_BINS
+_CURVATURE = SHAPE_BINS + CURVED_BINS + MEAN_BINS  # bins
 # kernels read numbers, not dictionaries
 _CURVED, _UP = BLOCKS["curvature"].start, BLOCKS["up"].start
 _RING_GEODESIC, _RING_EUCLIDEAN, _RING_CURVED = (
@@ -70,8 +70,8 @@ def distributions(surface: Surface, normals: F4, curvatures: F4, out: F4) -> Non
 
     Rings are intervals of the mean geodesic distance to the other neurons; bands are intervals of
     height. ``normals`` (3, k) and ``curvatures`` (2, k) of the k neurons are from `fit_surfaces`;
-    ``out`` is the whole descriptor, of which the blocks ``curvature`` to ``band_curvature`` are
-    written.
+    ``out`` is the whole descriptor; its blocks ``curvature`` to ``band_curvature`` are written, and
+    must be zeros before.
     """
     euclidean, geodesic, weight = surface.euclidean, surface.geodesic, surface.weight
     z = surface.neurons[2]
@@ -121,8 +121,8 @@ def distributions(surface: Surface, normals: F4, curvatures: F4, out: F4) -> Non
 def _curvature_row(row: F4, first: float, second: float) -> None:
     """Write the histograms of one neuron with the principal curvatures ``first`` and ``second``.
 
-    The first elements of ``row`` become a 1 and the histograms of shape index, curvedness and mean
-    curvature.
+    The first elements of ``row``, zeros, become a 1 and the histograms of shape index, curvedness
+    and mean curvature.
     """
     row[0] = 1
     spread = first - second

@@ -11,6 +11,7 @@ from shapecat.jit import kernel
 __all__ = ["principal_axes", "solve"]
 
 _SINGULAR = 1e-10
+"""A diagonal element that one elimination step reduces to this fraction counts as 0."""
 _SWEEPS = 8
 """Number of sweeps of the Jacobi method. Each sweep doubles the valid digits; five usually
 suffice."""

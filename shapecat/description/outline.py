@@ -17,14 +17,14 @@ _SLICE = ("width", "aside")
 OUTLINE_NAMES = (
     *(f"upright_{i}_{name}" for i in range(OUTLINE_SLICES) for name in _SLICE),
     *(f"long_{i}_{name}" for i in range(OUTLINE_SLICES) for name in _SLICE),
-    "upright_length",
+    "upright_length",  # length / (length + largest width)
     "long_length",
-    "long_level",
-    "upright_fill",
+    "long_level",  # absolute cosine between the principal axis and the horizontal
+    "upright_fill",  # mean width / largest width
     "long_fill",
 )
 _UPRIGHT, _TO_NARROW = np.bool_(0), np.bool_(1)  # Python's bools are compiled as two versions
-_LONG, _END = 2 * OUTLINE_SLICES, 4 * OUTLINE_SLICES
+_LONG, _END = 2 * OUTLINE_SLICES, 4 * OUTLINE_SLICES  # ends of both kinds of slices in the block
 
 
 @kernel
@@ -88,7 +88,7 @@ def _widths(
     to_narrow: bool,  # noqa: FBT001  compiled kernels take their arguments by position
     out: F4,
 ) -> tuple[float, float]:
-    """Write width and offset of each slice to ``out``, relative to the largest width.
+    """Write ``width`` and ``aside`` of each slice to ``out``, relative to the largest width.
 
     ``along`` and ``across`` (n,) are coordinates of the points; the slices divide the length, which
     is the `inner_range` of ``along``. With ``to_narrow``, they go from the wide to the narrow end.

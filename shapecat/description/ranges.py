@@ -9,7 +9,9 @@ __all__ = ["inner_range", "outer_range"]
 
 _BINS = 64
 _OUTSIDE = 0.02
+"""Fraction of the values below, and above, the inner range."""
 _LEAST = 1e-30
+"""Smallest range that is divided into bins; a smaller one is returned whole."""
 
 
 @kernel(fast=True)

@@ -12,20 +12,23 @@ __all__ = ["REVOLUTION_NAMES", "fit_axis", "revolution"]
 _REVOLUTION_SLICES = 8
 _SLICE = ("share", "radius", "residual", "inward")
 REVOLUTION_NAMES = (
-    "upright_residual",
-    "upright_radius",
-    "residual",
-    "length",
-    "axis_vertical",
-    "axis_moved",
-    "axis_to_eye",
+    "upright_residual",  # root mean square deviation of the radius in a slice / mean radius
+    "upright_radius",  # radius / (radius + length)
+    "residual",  # the same about the tilted axis, which all others describe
+    "length",  # length / (length + radius)
+    "axis_vertical",  # absolute cosine between the axis and up
+    "axis_moved",  # absolute cosine between the axis and its first guess
+    "axis_to_eye",  # cosine between the axis, towards the narrow end, and the way to the sensor
     *(f"{i}_{name}" for i in range(_REVOLUTION_SLICES) for name in _SLICE),
 )
 _ROUNDS = 4
+"""Number of Gauss-Newton steps."""
 _OUTLIER = 3.0
 """Huber threshold of the fit, in root mean square residuals."""
 _DAMPING = 0.02
+"""Damping of the steps, relative to the mean diagonal element of the normal matrix for shifts."""
 _INWARD = -0.3
+"""A point faces the axis if its normal has a smaller component than this away from the axis."""
 _SHIFTS, _SHIFTS_AND_TILTS = np.int64(2), np.int64(4)  # numba compiles a version per literal
 
 
@@ -239,9 +242,9 @@ def _measure(
     """Write the profile of all points about an axis, one row of ``slices`` (k, 4) per slice.
 
     The other parameters are as in `_cylindrical_coordinates`. A row is the slice's fraction of all
-    points, the mean and the standard deviation of the radius, and the fraction of its points that
-    face the axis. Returns the root mean square of the deviations in all slices, the length along
-    the axis, and the mean radius.
+    points, the mean and the standard deviation of the radius (0 where all normals are along the
+    axis), and the fraction of its points that face the axis. Returns the root mean square of the
+    deviations in all slices, the length along the axis, and the mean radius.
     """
     first, second = _perpendicular_axes(axis)
     rows, extent = _cylindrical_coordinates(cloud, owner, normals, axis, point, first, second)

@@ -10,27 +10,29 @@ from shapecat.jit import kernel
 __all__ = ["SOLID_NAMES", "solids"]
 
 SOLID_NAMES = (
-    "box_sides",
-    "box_faces",
-    "box_narrow_to_wide",
-    "box_height",
-    "corner_upright",
-    "corner_level_1",
+    "box_sides",  # mean distance of steep surface from the nearer side / horizontal size
+    "box_faces",  # mean distance of the points from the nearest visible face / size
+    "box_narrow_to_wide",  # shorter / longer horizontal length
+    "box_height",  # height / (height + horizontal size)
+    "corner_upright",  # gap at the upright edge between the sides: 0 if points reach it, up to 1
+    "corner_level_1",  # the same for the edges between top and sides, the smaller gap first
     "corner_level_2",
-    "share_side_1",
+    "share_side_1",  # fraction of the points nearest to a face; side 1 has more than side 2
     "share_side_2",
     "share_top",
-    "off_side_1",
+    "off_side_1",  # their mean distance from that face / size
     "off_side_2",
     "off_top",
-    "box_to_revolution",
-    "box_to_upright",
-    "ball_residual",
-    "ball_radius",
-    "ball_height",
-    "ball_to_box",
+    "box_to_revolution",  # log-ratio of box_faces to the residual of the solid of revolution
+    "box_to_upright",  # log-ratio of box_sides to the residual of the upright one
+    "ball_residual",  # mean distance of the points from the ball / radius
+    "ball_radius",  # radius / (radius + height of the object)
+    "ball_height",  # height of the centre: 0 at the bottom of the object, 1 at its top
+    "ball_to_box",  # log-ratio of ball_residual to box_faces
 )
+"""The features of a box and a ball; sizes of the box are root mean squares of its lengths."""
 _YAWS = 36
+"""Number of yaws tried, 2.5 degrees apart."""
 
 
 @kernel
@@ -116,7 +118,7 @@ def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, o
     """Compare the points with the three faces of a box that the sensor can see.
 
     ``u`` and ``v`` (n,) are from `_box_frame`, ``z`` (n,) is the height; the other parameters are
-    as in `solids`. Writes to ``out`` (13,).
+    as in `solids`. Writes the first 13 features of `SOLID_NAMES` to ``out``.
     """
     count = u.size
     low_u, high_u = inner_range(u)
@@ -158,7 +160,8 @@ def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, o
 def _ball(cloud: F4, low: float, high: float, out: F4) -> None:
     """Compare the points with the ball fitted to them by least squares.
 
-    The parameters are as in `solids`; ``out`` is (3,).
+    The parameters are as in `solids`. Writes the features ``ball_residual``, ``ball_radius`` and
+    ``ball_height`` to ``out``.
     """
     A, b = np.zeros((4, 4)), np.zeros(4)
     row = np.zeros(4)
