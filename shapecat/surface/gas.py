@@ -18,7 +18,9 @@ MIN_POINTS = 24
 _MAX_POINTS = 1200
 """Maximum number of points used, every k-th of a larger cloud. More points only take longer."""
 _NEURONS_PER_POINT = 0.45
+"""Maximum number of neurons per point."""
 _FEWEST_NEURONS = 12
+"""Lower bound of that maximum number of neurons, for small clouds."""
 _SPACING_SAMPLES = 64
 """Approximate number of points whose distance to the nearest other point is averaged."""
 _RATES = Rates(winner=0.1, neighbour=0.006, oldest=30)
@@ -86,8 +88,8 @@ def reconstruct(
 def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float) -> tuple[F4, U2]:
     """Grow a gas on points (m, 3), metres, by Algorithm 3 of the thesis.
 
-    ``neurons``, ``signals`` and ``share`` (``component_share``) are as in `SurfaceSettings`.
-    Returns the neurons (k, 3), metres, and the edges (e, 2).
+    ``neurons``, ``signals`` and ``share`` (``component_share``) are as in `SurfaceSettings`;
+    ``seed`` starts the random generator. Returns the neurons (k, 3), metres, and the edges (e, 2).
     """
     cloud, shift_scale = _normalise(points)
     target = _target_size(cloud, neurons)

@@ -210,8 +210,8 @@ def grow_thesis(
     """Grow a gas of two neurons until its neurons are close to the points; return their number.
 
     Source: thesis 5.2, Algorithm 4, which changes two steps of Algorithm 3. Step 12: a neuron is
-    inserted where the error exceeds a limit. Step 18: the cloud is presented again, at least three
-    times, until the mean distance of the neurons to their nearest point (psi) is below a limit.
+    inserted where the error exceeds a limit. Step 18: the cloud is presented at least three times,
+    until the mean distance of the neurons to their nearest point (psi) is below a limit.
 
     Parameters
     ----------

@@ -16,7 +16,9 @@ _FEWEST_PLANE, _FEWEST_QUADRIC = 4, 9
 """Minimum numbers of neighbours, including the point itself, for a plane and for a quadric: a few
 more than their unknowns."""
 _RIDGE = 1e-4
+"""Ridge penalty on the coefficients of the quadric, relative to the weight of the neighbours."""
 _SQUARINGS = 6
+"""Number of squarings in `_least_direction`."""
 
 
 def thin(points: F4, *, settings: SurfaceSettings) -> F4:
@@ -181,7 +183,8 @@ def _plane(offsets: F8, n: int) -> tuple[F8, float]:
 def _least_direction(spread: F8) -> F8:
     """Return the unit eigenvector of the smallest eigenvalue of a symmetric (3, 3) matrix.
 
-    This vector belongs to the largest eigenvalue of the adjugate, whose powers converge to it.
+    This vector belongs to the largest eigenvalue of the adjugate, whose powers converge to it. The
+    diagonal of ``spread`` is changed in place.
     """
     power = np.zeros((3, 3))
     for a in range(3):

@@ -11,6 +11,7 @@ _FRACTION_BITS = 16
 """Coordinates are summed as integers, in units of 2**-16 voxels, so that the order of the points
 does not matter."""
 _RADIX_BITS = 11
+"""Number of bits of the keys that one pass of the radix sort compares."""
 _LARGEST = np.int64(1 << 62)
 
 
