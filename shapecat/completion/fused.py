@@ -238,7 +238,7 @@ def _widths(outlines: F8) -> F8:
 
 
 def _turned(outlines: F8, angles: F8) -> F8:
-    """Return outlines (k, n), each turned by its angle (k,), radians, with interpolation."""
+    """Return outlines (k, 96), each turned by its angle (k,), radians, with interpolation."""
     rows = np.arange(len(outlines))[:, None]
     steps = np.arange(DIRECTIONS) - angles[:, None] * (DIRECTIONS / (2 * np.pi))
     before = np.floor(steps).astype(np.int64)
@@ -248,7 +248,7 @@ def _turned(outlines: F8, angles: F8) -> F8:
 
 
 def _alike(axes: F8, sizes: F8, size: F8) -> F8:
-    """Return axes (k, 3, 3), turned by 90 degrees where their longer side is shorter in ``size``.
+    """Return axes (k, 3, 3), turned by 90 degrees where the other side is longer in ``size``.
 
     ``sizes`` (k, 3) are the lengths along these axes, ``size`` (3,) those of the fused box.
     """

@@ -29,6 +29,7 @@ _ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 COSINES, SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 QUARTER, _HALF = DIRECTIONS // 4, DIRECTIONS // 2
 _ROUNDS = 5
+"""Number of iterations of `fit_oval`."""
 _OUTLIER = 0.03
 """Huber threshold of the fit, as a fraction of the radius: handles deviate more."""
 

@@ -25,7 +25,7 @@ ENOUGH_POINTS = 256
 """Maximum number of points used for the outline; more only cost time."""
 
 _TOP = 0.98
-"""Fraction of the points below the top; the others count as noise."""
+"""Fraction of the points below the top; the others count as noise, and as many of the lowest."""
 _NOISY_M = 0.004
 """Largest height by which noise lifts points of a flat top, metres."""
 _FLAT = 1 / 3
@@ -42,7 +42,9 @@ _NOISE_M = 0.006
 _GUESS = 0.35
 """Standard deviation of the guessed part of a length, as a fraction of this part."""
 _ANGULAR, _HANDLED = "box", "cup"
+"""The category whose footprint has corners, and the one with a handle."""
 _CIRCULAR = 1e3
+"""A value of ``roundness`` that leaves only circles."""
 
 
 class _OutlinePrior(NamedTuple):
@@ -55,7 +57,8 @@ class _OutlinePrior(NamedTuple):
     noise : metres, the spread of the depths on a flat side.
     roundness : weight of the prior for a circle, as a number of directions. A prior is needed
         since the visible side says little about how deep the object is.
-    fits : largest deviation of the visible side from an accepted oval, as a fraction of its radius.
+    fits : largest root mean square deviation of the visible side from an accepted oval, as a
+        fraction of its radius.
     """
 
     stray: float = 0.016
@@ -149,8 +152,8 @@ def footprint(outline: F8, facing: F8, posterior: F8, categories: Sequence[str])
 
     Parameters
     ----------
-    outline : (k,) metres, the support function of the visible points.
-    facing : (k,) weight of each direction, 0 for those that face no sensor.
+    outline : (96,) metres, the support function of the visible points.
+    facing : (96,) weight of each direction, 0 for those that face no sensor.
     posterior : (c,) probabilities, in the order of ``categories``.
     """
     likely = dict(zip(categories, np.asarray(posterior).tolist(), strict=True))
@@ -193,8 +196,8 @@ def _visible_outline(points: F4, facing: Bool, category: str) -> F8:
 def _bounds(heights: F4) -> tuple[float, float, float]:
     """Return bottom, lowest visible height and top of an object, metres, without outliers.
 
-    ``heights`` (n,) are those of its points above the support. The bottom is at 0, or below it if
-    the whole object is.
+    ``heights`` (n,) are those of its points above the support. The bottom is at 0, or at the top if
+    that is lower.
     """
     ascending, stray = np.sort(heights), int((1 - _TOP) * len(heights))
     lowest, top = float(ascending[stray]), float(ascending[-1 - stray])
