@@ -32,7 +32,7 @@ hole."""
 def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
     """Average the depths of a depth image with those of earlier ones, and fill its holes.
 
-    1. An earlier image counts if most of its depths agree with the current ones.
+    1. An earlier image of the same camera counts if most of its depths agree with the current ones.
     2. A depth becomes the mean of itself and the earlier depths that agree with it (`AGREE`; a
        larger limit would smear low objects that move). Where they disagree, something has moved or
        was hidden, and the current depth stays.
@@ -80,7 +80,8 @@ def keep_same_surface(scene: Scene, frame: Frame, perceived: Frame) -> Scene:
 
     Parameters
     ----------
-    scene : the result of detection on ``perceived``; returned unchanged for point clouds.
+    scene : the result of detection on ``perceived``; returned unchanged for point clouds. A
+        candidate may lose all its pixels.
     frame : pixels without depth in this frame, or with the depth of another surface, are removed.
     perceived : the frame in which ``scene`` was detected instead of ``frame``: fused, or earlier.
     """
@@ -209,7 +210,8 @@ def _add_moved(expected: F4, earlier: F4, homography: F4, shift: F4, total: F4, 
 def _project_row(depths: F4, v: int, homography: F4, shift: F4, x: F4, y: F4, z: F4) -> None:
     """Write column x, row y and depth z (w,), in the earlier image, of the pixels in row ``v``.
 
-    ``depths`` (w,) are those of the row; ``homography`` and ``shift`` are from `_homography`.
+    ``depths`` (w,) are a row of `_expected_depth`, whose sign is ignored; ``homography`` and
+    ``shift`` are from `_homography`. Depths ``z`` below `NEAREST_M` are raised to it.
     """
     min_depth = np.float32(NEAREST_M)
     row = np.float32(v)
@@ -225,9 +227,9 @@ def _project_row(depths: F4, v: int, homography: F4, shift: F4, x: F4, y: F4, z:
 
 @kernel(inner=True)
 def _interpolate(earlier: F4, x: float, y: float) -> Any:
-    """Interpolate between the four depths around column x and row y of an image; 0 outside it.
+    """Interpolate depths (h, w) bilinearly at column x and row y; return 0 outside the image.
 
-    It is also 0 if more than half of the weight belongs to missing depths.
+    The result is also 0 if more than half of the weight belongs to missing depths.
     """
     rows, columns = earlier.shape
     zero, one = np.float32(0), np.float32(1)

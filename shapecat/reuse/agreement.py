@@ -30,9 +30,9 @@ def agreement(
 
     Returns
     -------
-    The fraction of the compared points that agree with ``other``, and the mean inverse depth, in
-    1/m, by which ``other`` sees the agreeing points nearer; (0, 0) if too few points have depth
-    there or none agrees.
+    The fraction of the compared points that agree with ``other``, and the mean difference of their
+    inverse depths, 1/m, positive if ``other`` sees the agreeing points nearer; (0, 0) if too few
+    points are comparable (`_KNOWN`) or none agrees.
     """
     # Writable, in C order, so that the kernel is compiled only once.
     rotation = np.array(other_from_one.rotation, order="C")

@@ -221,6 +221,7 @@ def _agree(one: ObjectView, other: ObjectView, move: Pose) -> bool:
 
 
 _REST = Move(IDENTITY, IDENTITY, np.array([0.0, 0.0, 0.0, 1.0]))
+"""The move of a sensor at rest."""
 
 
 def _between(one: ObjectView, other: ObjectView) -> Move:
