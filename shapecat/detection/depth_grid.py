@@ -44,6 +44,7 @@ STRAIGHT_SHARE = 0.3
 """Minimum extent of the samples along the inner edge of a border, as a fraction of the image side.
 If it is less, the blank area merely ends at a tall object, and is not a border."""
 LARGEST_FACTOR = 16
+"""Upper bound of `DepthGrid.factor`."""
 STEP_M = 0.004
 """Smallest step between two surfaces, metres. It matters only near the camera, where even a slanted
 surface changes from cell to cell by more than a `DISCONTINUITY`."""

@@ -149,7 +149,7 @@ def _detect_in_cloud(points: F4, hint: F8 | None, task: Task) -> Scene | None:
 
 
 def _segment_view(view: VirtualImage, hint: F8 | None, task: Task) -> Segmentation | None:
-    """Find planes and objects in a virtual image; ``hint`` is in the frame of the cloud."""
+    """Do the work of `_segment` for a virtual image; ``hint`` is in the frame of the cloud."""
     view_hint = None if hint is None else view.view_from_sensor.rotation @ hint
     return _segment(view.grid, view_hint, task, upright=False)
 

@@ -19,8 +19,8 @@ WIDEST_SLOPE = 1.5
 OUTSIDE = 9.0
 """Placeholder for the slope x / z of a point that is not in view."""
 MAX_CELLS = 400_000
-MAX_ROWS = 2000
-MIN_POINTS = 100
+MAX_ROWS = 2000  # and columns
+MIN_POINTS = 100  # in view
 POINTS_PER_CELL = 1.8
 """Minimum number of points per occupied cell, on average; with fewer, surfaces have holes."""
 
@@ -246,9 +246,10 @@ def _spacing(slopes: F4, bounds: F8, n: int) -> float:
 
 @kernel
 def _count_occupied(slopes: F4, left: float, top: float, scale: float, side: int) -> int:
-    """Return how many cells of a grid of ``side`` rows and columns have a point.
+    """Count the cells of a grid of ``side`` rows and columns that have a point.
 
-    The grid begins at the slopes ``left`` and ``top``, with ``scale`` cells per unit of slope.
+    The grid begins at the slopes ``left`` and ``top``, with ``scale`` cells per unit of slope;
+    ``slopes`` (n, 2) are from `_to_view`.
     """
     occupied = np.zeros((side, side), np.uint8)
     n = 0

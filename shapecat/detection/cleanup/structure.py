@@ -65,7 +65,8 @@ def find_background(
 ) -> Bool:
     """Return which segments to reject after merging, as structure or for their size: (n + 1,) bool.
 
-    ``features`` (n + 1,) are from `measure_object_features`.
+    It is False for segments that were merged into another. ``features`` (n + 1,) are from
+    `measure_object_features`.
     """
     roots = roots_of(segments)
     merged = features[roots]

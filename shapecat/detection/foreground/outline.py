@@ -97,8 +97,8 @@ def measure_outline(
     Parameters
     ----------
     inv_depth : (rows, columns) 1/m.
-    residual : (rows, columns) inverse depth minus that of the plane, 1/m; 0 in cells that are not
-        low (`LowProfileSettings.low_m`).
+    residual : (rows, columns) 1/m, from `measure_residual` or `filter_high_pass`; 0 in cells that
+        are not low (`LowProfileSettings.low_m`).
     plane_id : (rows, columns) as in `HeightMap`.
     part : (rows, columns) numbers of the parts.
     cells, count : the first ``count`` elements of ``cells`` are the flat indices of this part's

@@ -170,8 +170,8 @@ def _bounds(
 ) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """Return the first and last column with a height in row i, and bounds of the inverse depth.
 
-    ``line`` (columns,) are the heights of the row, `OUT` where there is none. The lower and upper
-    bound, 1/m, hold for all cells of the row that have a height.
+    ``line`` (columns,) are the heights of the row, at least one, and `OUT` where there is none. The
+    lower and upper bound, 1/m, hold for all cells of the row that have a height.
     """
     left, right = 0, line.size - 1
     while line[left] <= OUT:

@@ -84,7 +84,10 @@ def _every_second(points: OrientedPoints, intrinsics: PinholeIntrinsics) -> F4:
 
 @kernel(inline=True)
 def _bins_of(surface: F4) -> int:
-    """Return the number of bins of `UpSettings.level_bin_m` up to the farthest point of (8, n)."""
+    """Return the number of bins of `UpSettings.level_bin_m` up to the farthest point.
+
+    ``surface`` (8, n) is from `_every_second`.
+    """
     farthest2 = 0.0
     for k in range(surface.shape[1]):
         x, y, z = surface[3, k], surface[4, k], surface[5, k]

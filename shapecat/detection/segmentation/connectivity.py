@@ -184,7 +184,7 @@ def _link_run(
 
 @kernel
 def _measure_concavity(grid: DepthGrid, graph: SurfaceGraph) -> None:
-    """Write the largest concave angle between the surfaces on opposite sides of each cell."""
+    """Write ``graph.concavity``: compare the local planes on opposite sides of each object cell."""
     inv_depth, gate = grid.inverse_depth, np.float32(2 * grid.discontinuity)
     rows, columns = inv_depth.shape
     local_plane, concavity = graph.local_plane, graph.concavity
@@ -279,7 +279,7 @@ def _raise_concavity(
 
 @kernel(fast=True, inner=True)
 def _write_angles(plane_w: F4, worst: F4, concavity: U1) -> None:
-    """Write the angles of squared chords, in degrees; 0 for cells without a local plane.
+    """Write the angles of squared chords, degrees, up to 120; 0 for cells without a local plane.
 
     All arrays are of the object cells of a row (n,): ``plane_w``, the inverse depth of the local
     planes; ``worst``, the squared chords from `_raise_concavity`; ``concavity``, which is written.

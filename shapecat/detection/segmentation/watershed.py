@@ -16,6 +16,7 @@ __all__ = ["SeedSplitter", "watershed"]
 NO_EDGE = 255
 """Concave angle that no edge reaches, degrees."""
 BUCKETS = 256 // SEGMENTATION.bucket_deg
+"""Number of ranges of concave angles."""
 SeedSplitter = Callable[[SurfaceGraph, I4, int], int]
 """A function that gets (graph, labels, n), splits the seeds 1..n of ``labels`` (rows, columns) in
 place, and returns the new n."""
