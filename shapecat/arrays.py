@@ -71,6 +71,7 @@ def freeze(
 
 
 Axes = tuple[int | str, ...]
+"""A parsed shape: sizes and names of axes."""
 
 
 def _axes(shape: str) -> Axes:
@@ -105,7 +106,10 @@ def _agree(axes: Axes, shape: tuple[int, ...], sizes: dict[str, int]) -> bool:
 
 
 def array(shape: str, dtype: str, **options: Any) -> Any:
-    """Declare an array field of a `Record`, with its shape (as in `freeze`) and its type."""
+    """Declare an array field of a `Record`, with its shape (as in `freeze`) and its type.
+
+    ``options`` are those of `dataclasses.field`.
+    """
     return field(metadata={"shape": shape, "dtype": dtype}, **options)
 
 

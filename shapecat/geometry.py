@@ -52,7 +52,7 @@ BOX_EDGES = np.array(
     + [(k + 4, (k + 1) % 4 + 4) for k in range(4)]
     + [(k, k + 4) for k in range(4)]
 )
-"""The edges of a box (12, 2) as pairs of corners, in the order of `box_corners`."""
+"""The edges of a box (12, 2): pairs of indices into the corners from `box_corners`."""
 
 
 def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
@@ -145,6 +145,8 @@ row_quaternion = kernel(_quaternion)
 
 def gravity_rotation(up: ArrayLike) -> F8:
     """Return ``level_from_sensor``: a (3, 3) rotation that turns ``up`` into +z.
+
+    ``up`` (3,) is a vector of any length but zero, in the sensor frame.
 
     The level x axis is the horizontal part of the sensor's x axis, or of its y axis if the x axis
     is steeper than about 45 degrees, so that this part is never small.
@@ -278,7 +280,7 @@ def box_corners(box: Box) -> F8:
 
 
 def box_around(boxes: Iterable[Box], up: ArrayLike) -> Box:
-    """Return the `upright_box` around the corners of boxes."""
+    """Return the `upright_box` around the corners of one or more boxes."""
     corners = np.concatenate([box_corners(box) for box in boxes])
     return upright_box(corners.astype(np.float32), up)
 

@@ -113,7 +113,10 @@ def _stage_of(file: Path) -> Path:
 
 
 def _digest(stage: Path) -> str:
-    """Return a digest of the files of a stage and of the shared files."""
+    """Return a digest of the Python files of a stage and of the shared ones, 16 hex digits.
+
+    If the package itself is the stage, only the shared files count.
+    """
     files = set(_SHARED)
     if stage != _HERE:  # os.walk, since another process may be removing folders of kernels
         found = (Path(folder, name) for folder, _, names in os.walk(stage) for name in names)
