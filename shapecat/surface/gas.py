@@ -106,7 +106,8 @@ def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float)
 def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U2]:
     """Grow a gas on points (m, 3), metres, by Algorithm 4 of the thesis.
 
-    The other parameters and the results are as in `_by_fritzke`.
+    The other parameters and the results are as in `_by_fritzke`, but up to twice as many neurons
+    grow.
     """
     cloud, shift_scale = _normalise(points)
     target = _target_size(cloud, neurons)
