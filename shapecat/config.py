@@ -62,9 +62,11 @@ class SurfaceSettings:
     """Insertion of neurons: `fritzke` at a fixed interval of signals (thesis, Algorithm 3),
     `thesis` where the accumulated error is large (Algorithm 4)."""
     neurons: int = 80
-    """Number of neurons at the end of growth; fewer on small clouds."""
+    """Number of neurons at the end of growth; fewer on small clouds, up to twice as many with
+    method `thesis`."""
     signals: int = 6000
-    """Total number of signals: points drawn at random to adapt the neurons."""
+    """Total number of signals: points presented in random order to adapt the neurons; method
+    `thesis` decides itself."""
     component_share: float = 0.35
     """Separate parts of the graph with a smaller fraction of the points than this are dropped."""
     voxel_m: float = 0.005

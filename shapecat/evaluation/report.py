@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from shapecat.arrays import F4, I4
+from shapecat.arrays import F4, Bool
 from shapecat.errors import ModelError
 from shapecat.evaluation import metrics
 from shapecat.evaluation.fused import Fused, fuse_views
@@ -198,7 +198,7 @@ def _novelty_figures(unknown: F4, known: F4) -> dict[str, float | None]:
     }
 
 
-def _accuracy_over(values: np.ndarray, right: I4, edges: Sequence[float], unit: str) -> Ranges:
+def _accuracy_over(values: np.ndarray, right: Bool, edges: Sequence[float], unit: str) -> Ranges:
     """Return (range, views, accuracy) for each range [low, high) between ``edges`` that has views.
 
     ``values`` (n,) is the quantity of each view, in ``unit``; ``right`` (n,) is whether its

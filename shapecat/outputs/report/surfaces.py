@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from shapecat.arrays import F4, F8, U1, U2, Bool, Record, array
+from shapecat.arrays import F4, F8, U1, Bool, Record, array
 from shapecat.outputs.png import png, with_palette
 from shapecat.surface.triangles import triangles_of
 from shapecat.types import NeuralGas
@@ -185,7 +185,7 @@ def _blurred(image: F8) -> F8:
     return np.asarray(ndimage.uniform_filter(image, 3, mode="constant"))
 
 
-def _palette(colour: tuple[int, int, int]) -> tuple[U1, U2]:
+def _palette(colour: tuple[int, int, int]) -> tuple[U1, U1]:
     """Return a palette (k, 3), and the opacity (1,) of its first entry, which is transparent.
 
     The other entries are shades of ``colour``, the darkest first.
