@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 @click.option(
     "--out",
     type=ANY_PATH,
-    help="New folder for a page with pictures, a table of all objects, and the metrics as JSON.",
+    help="New folder for three files: a page with pictures, a table of all objects, and the "
+    "metrics as JSON.",
 )
 @recording_option
 @json_option

@@ -34,7 +34,7 @@ _NO_VAL = (
     required=True,
     help="Format of the export, listed above.",
 )
-@click.option("--out", type=ANY_PATH, required=True, help="Folder for the export.")
+@click.option("--out", type=ANY_PATH, required=True, metavar="OUT", help="Folder for the export.")
 @click.option(
     "--every", type=click.IntRange(1), default=1, metavar="N", help="Keep only every Nth frame."
 )

@@ -131,11 +131,11 @@ def process(
     """Find, categorize and track the objects in recordings.
 
     Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a folder with
-    recordings, or a URL. The results of lab.mcap go to OUT/lab: tables, annotated.mcap for
-    Foxglove, and review.rrd for Rerun. If recordings have the same name, the name of their
-    folder is put in front, as in OUT/monday_lab; if that is not enough, a number is appended.
-    For several recordings, OUT/manifest.jsonl records the state of each. To resume after an
-    interruption, run the same command again.
+    recordings, or a URL. The results of lab.mcap go to the folder OUT/lab, called a run:
+    tables, annotated.mcap for Foxglove, and review.rrd for Rerun. If recordings have the same
+    name, the name of their folder is put in front, as in OUT/monday_lab; if that is not enough,
+    a number is appended. For several recordings, OUT/manifest.jsonl records the state of each.
+    To resume after an interruption, run the same command again.
 
     \b
     shapecat process lab.mcap kitchen.bag --out results

@@ -66,9 +66,9 @@ def simulate(
 ) -> None:
     """Simulate a recording of objects, with ground truth beside it.
 
-    OUT is NAME.mcap, NAME.bag (ROS 1), or NAME for a ROS 2 bag. NAME.truth.json holds the
-    objects of each frame, and NAME.labels.npz the object that each depth pixel shows. With --color,
-    NAME.color_labels.npz holds the object that each colour pixel shows.
+    OUT is NAME.mcap, NAME.bag (ROS 1), or NAME for a ROS 2 bag. NAME.truth.json lists the
+    objects in each frame; NAME.labels.npz says which object each depth pixel shows, and with
+    --color, NAME.color_labels.npz which object each colour pixel shows.
 
     \b
     Scenes:

@@ -178,13 +178,10 @@ def test_processing_loads_no_library_too_early() -> None:
     assert loaded_by(code, never) == set()
 
 
-def test_commands_do_not_load_libraries_that_others_ask_for(
+def test_commands_do_not_load_optional_imports_of_libraries(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Arrow would load pandas for its first array, numba SciPy for its first kernel.
-
-    This takes half a second and a tenth of a second.
-    """
+    """Arrow would load pandas for its first array (0.5 s), and numba would load SciPy (0.1 s)."""
     monkeypatch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)  # `make coverage` sets it
     code = (
         "import types, pyarrow, numpy as np, shapecat.__main__ as entry;"

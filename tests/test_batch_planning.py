@@ -211,7 +211,7 @@ def test_other_model_version_or_content_gives_other_work_id(source: Path, key: s
 
 @pytest.mark.parametrize("name", ["color", "mcap", "rrd", "boxes"])
 def test_output_options_keep_work_id(source: Path, name: str) -> None:
-    """Labels of a run without a review must also fit the same run with a review."""
+    """Labels must still apply after the recording is processed again with other outputs."""
     changed: Any = {"color": {"color": ""}, "mcap": {"mcap": False}, "rrd": {"rrd": False}}
     changed["boxes"] = {"settings": with_overrides(Settings(), ["outputs.boxes=visible"])}
     run, other = planned(source), planned(source, **changed[name])

@@ -379,7 +379,10 @@ def test_conflicting_labels_are_reported_not_applied(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("digest", ["xxh3-128:one", "xxh3-128:two"])
 def test_merged_tracks_may_be_one_track_in_target(tmp_path: Path, digest: str) -> None:
-    """If they were matched by position, the two parts would compete for one track."""
+    """If each were matched alone, the two merged tracks would compete for one track.
+
+    The target is of the same recording, or of another one.
+    """
     objects = {1: static(CUP, frames=range(7)), 2: static(CUP, frames=range(7, 10))}
     labels = {1: "mug", 2: "merge with 1"}
     source = make_run(tmp_path / "source", objects, labels=labels)

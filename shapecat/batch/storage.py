@@ -100,12 +100,12 @@ class Location:
 
         Parameters
         ----------
-        error : class of the errors that failures raise.
+        error : class of the exceptions that this location raises.
 
         Raises
         ------
         ConfigError : a library is not installed.
-        ShapecatError : the URL is invalid.
+        error : the URL is invalid.
         """
         self.url, self._error = url, error
         self._system, self._path = _connect(url, error)
@@ -115,7 +115,7 @@ class Location:
 
     @property
     def root(self) -> str:
-        """The URL of this folder, as at the start of the URLs that `walk` yields."""
+        """The URL of this folder, in the form with which the URLs from `walk` begin."""
         return self._url_of({"name": self._path})
 
     def _retry(self, participle: str, call: Callable[[], _T]) -> _T:

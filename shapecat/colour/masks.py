@@ -182,11 +182,11 @@ def _update_row(labels: I4, packed: I4, result: I4) -> None:
 
 @kernel
 def _fill(labels: I4, region: tuple[int, int, int, int], narrow: int, wide: int) -> None:
-    """Add to objects the pixels that they surround in a region, with one sweep each way.
+    """Within a region, give pixels of label 0 or -1 the label of the object that surrounds them.
 
-    ``labels`` (h, w) is changed in place; ``region`` is left, top, right + 1, bottom + 1;
-    ``narrow`` and ``wide`` are as in `_surrounding`. A pixel changes only after its old label has
-    been passed on in all four directions.
+    This takes one forward and one backward pass. ``labels`` (h, w) is changed in place; ``region``
+    is left, top, right + 1, bottom + 1; ``narrow`` and ``wide`` are as in `_surrounding`. A pixel
+    changes only after its old label has been passed on in all four directions.
     """
     left, top, right, bottom = region
     height, width = bottom - top, right - left

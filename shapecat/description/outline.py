@@ -39,7 +39,8 @@ def outline(cloud: F4, eye: F4, out: F4) -> None:
     ----------
     cloud : (3, n) points, z up, in units of the mean distance between neurons.
     eye : (3,) position of the sensor in the same frame.
-    out : the block ``outline``, zeros, written in place; slices without points stay 0.
+    out : the part ``outline`` of the descriptor, zeros on entry, written in place;
+        slices without points stay 0.
     """
     across, upward = _image(cloud, eye)
     out[_END], out[_END + 3] = _widths(upward, across, _UPRIGHT, out[:_LONG])

@@ -70,7 +70,10 @@ def render_view(
 
 
 def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
-    """Draw a preset, half of the time mixed with another; vary its errors and its image size."""
+    """Draw a preset, half of the time mixed with another; vary its errors and its image size.
+
+    Return the name of the first preset, and the sensor.
+    """
     names = list(PRESETS)
     shares = np.array([_OFTEN.get(each, 1.0) for each in names])
     name, other = (str(each) for each in rng.choice(names, 2, p=shares / shares.sum()))

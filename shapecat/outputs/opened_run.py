@@ -244,7 +244,7 @@ class Run:
 
         Raises
         ------
-        OutputError : as for `frames`, apart from the recording.
+        OutputError : a table is unreadable, or the run has been replaced since it was opened.
         """
         return self._finished.frames()
 

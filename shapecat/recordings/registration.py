@@ -55,9 +55,9 @@ def _are_within(lens: LensCamera, camera: Camera | None, fraction: float) -> boo
 
 @lru_cache(maxsize=8)
 def _largest_offset_px(lens: LensCamera, camera: Camera | None) -> float:
-    """Return the largest distance, in x or y, from a pixel to where the lens images its ray.
+    """Return the largest offset from a pixel of a camera to its ray's projection through a lens.
 
-    The result is 0 without a camera or without distortion.
+    It is in pixels, along x or y; 0 without a camera or without distortion.
     """
     if camera is None or not lens.model:
         return 0.0

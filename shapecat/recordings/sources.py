@@ -165,7 +165,10 @@ class DepthSource(FrameSource):
             self._info, self._info_stamp = info, stamp
 
     def read(self, message: Message, index: int) -> Iterator[Frame]:
-        """Yield the frame of the previous image, and of this one if its calibration came first."""
+        """Yield the frame of the image held back, if any; then that of this image.
+
+        If the calibration with its stamp has not been read yet, this image is held back instead.
+        """
         yield from self.finish()
         with self.counting():
             image = self.recording.decode(message)

@@ -137,7 +137,7 @@ def open_source(
     Raises
     ------
     RecordingError : the recording is missing or unreadable, or its path is not valid UTF-8.
-    OutputError : the content of the recording has changed since it was processed.
+    OutputError : it is another recording, or its content has changed since it was processed.
     """
     path = moved_to or Path(run["input"]["path"])
     if moved_to is None and not path.exists():

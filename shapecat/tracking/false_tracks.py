@@ -29,9 +29,10 @@ def without_pieces(table: DetectionTable, tracks: Sequence[I4], max_gap_s: float
 
 
 def _covered(table: DetectionTable, track: I4, max_gap_s: float) -> int:
-    """Count the frames in which a track has no detection, but another box contains its centre.
+    """Count the frames in which a track has no detection, but another box contains its place.
 
-    Gaps of more than ``max_gap_s`` are left out.
+    The place is interpolated; ``track`` (d,) are the track's detections. Gaps of more than
+    ``max_gap_s`` are left out.
     """
     rows, detected = table.frame_span(track, max_gap_s)
     others, which = table.of_frames(rows[~detected])

@@ -46,9 +46,10 @@ def join_pieces(table: DetectionTable, tracks: Sequence[I4]) -> list[I4]:
 
 
 def _count_fits(table: DetectionTable, tracks: Sequence[I4]) -> Counter[tuple[int, int]]:
-    """Count, for each pair of tracks, the frames in which they are pieces of one object.
+    """Count, for each pair of tracks, the frames in which they could be pieces of one object.
 
-    ``tracks`` are the detections (n,) of each track.
+    ``tracks`` are the detections (n,) of each track. The keys are indices into it, the smaller
+    first.
     """
     owner, counts = table.track_of_each(tracks), Counter[tuple[int, int]]()
     whole_lengths = np.array([_whole_lengths_by_topic(table, track) for track in tracks])

@@ -258,10 +258,11 @@ def _large_levels(count: F8, areas: F8, min_weight: float) -> tuple[float, float
 
 @kernel(inner=True)
 def _count_levels(surface: F4, direction: F8, bins: int) -> tuple[F8, F8, float, float]:
-    """Sum the weights of the points that face a direction, in bins of height below the sensor.
+    """Sum the weights of the points that face a direction, in bins of distance below the sensor.
 
-    ``surface`` (8, n) is from `_every_second`. Returns the weight (bins,) and the area (bins,), m2,
-    in each bin; the sum of the weights in all bins; and the weight of all points.
+    The distance is along ``direction`` (3,); ``surface`` (8, n) is from `_every_second`. Returns
+    the weight (bins,) and the area (bins,), m2, in each bin; the sum of the weights in all bins;
+    and the weight of all points.
     """
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     nx, ny, nz, weights = surface[0], surface[1], surface[2], surface[6]

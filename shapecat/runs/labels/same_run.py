@@ -59,7 +59,10 @@ def _number(cell: str | None) -> float | None:
 
 
 def _described(folder: Path, work: str) -> str:
-    """Describe the run with the id ``work``; name folder and recording if it is in the folder."""
+    """Describe the run with the work id ``work``.
+
+    If it is the run in ``folder``, also name the folder and the recording.
+    """
     with suppress(OutputError, KeyError):
         run = read_run(folder)
         if run["work"] == work:

@@ -270,6 +270,9 @@ def _translate(
 
 
 def _why(track: int, whole: int, matches: Matches) -> str:
-    """Return the reason why a track has no match: its *whole* (see `_translate`) has none."""
+    """Return the reason why a track has no match, which is that of its *whole*.
+
+    The whole is the track that it is finally merged with, or itself (see `_translate`).
+    """
     reason = matches.reasons.get(whole, "nothing was found there")
     return reason if track == whole else f"track #{whole}, which it is merged with: {reason}"

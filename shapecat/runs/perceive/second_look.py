@@ -185,7 +185,7 @@ def _cos(degrees: float) -> float:
 
 
 def _streams(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[str, _Stream]:
-    """Join the frames and planes tables of all segments to one stream per topic."""
+    """Join the frames and planes tables of all segments into one stream per topic."""
     parts: dict[str, list[_Stream]] = {}
     for frames, planes in tables:
         for topic, part in _parts(frames, planes):
