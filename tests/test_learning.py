@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
+from scipy.optimize import minimize
 from sklearn.linear_model import LogisticRegression
 
 from shapecat.arrays import F4
@@ -347,6 +348,27 @@ def test_new_category_is_learned_on_fixed_trees(categorizer: Categorizer) -> Non
     assert np.mean(prediction.novelty[test.labels == "cone"] > 1) < 0.2
     unknown = extended.predict(blobs(100, 6, (UNKNOWN,)).descriptors).novelty
     assert np.mean(unknown > 1) > 0.8
+
+
+def test_learning_new_categories_can_be_interrupted(
+    categorizer: Categorizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stopped `learn` would go on for seconds, replace the model and end with exit code 0."""
+    monkeypatch.setattr(stopping, "_received", [])
+    losses = []
+
+    def minimize_and_stop(loss: Any, start: Any, **options: Any) -> Any:
+        losses.append(loss)
+        stopping.request()
+        return minimize(loss, start, **options)
+
+    monkeypatch.setattr("shapecat.learning.incremental.minimize", minimize_and_stop)
+    new = blobs(30, 7, ("cone",))
+    with pytest.raises(stopping.Stopped):
+        add_categories(
+            categorizer, new.descriptors, new.labels.tolist(), rng=np.random.default_rng(0)
+        )
+    assert len(losses) == 1
 
 
 def test_categories_can_be_added_twice(categorizer: Categorizer) -> None:

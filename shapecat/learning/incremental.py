@@ -13,6 +13,7 @@ from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.errors import ModelError
 from shapecat.learning.categorizer import Categorizer
 from shapecat.learning.known_views import KNOWN_VIEWS, choose_evenly
+from shapecat.system import stopping
 
 __all__ = ["add_categories"]
 
@@ -174,6 +175,7 @@ def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, l2: float, steps: i
 
     def loss(flat: F8) -> tuple[float, F8]:
         """Return the loss of the flattened weights, and its gradient."""
+        stopping.check()
         weights = flat.reshape(start.shape)
         new = _logits(inputs, weights)
         total = np.logaddexp.reduce(np.concatenate([offset, new], axis=1), axis=1)
