@@ -5,6 +5,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.testing import assert_allclose
 from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.dataset import read_dataset
 from shapecat.geometry import rotation_from_quaternion
+from shapecat.outputs.exports import crops
 from shapecat.outputs.exports.crops import Origin
 from shapecat.outputs.exports.formats import common_categories, export_run
 from shapecat.outputs.exports.kitti import rectified_from_sensor
@@ -208,6 +210,31 @@ def test_exporting_again_removes_views_with_earlier_labels(run: Path, tmp_path: 
     assert next(c for name, c in places.items() if name.endswith("track-2")) == "vase"
     assert not (tmp_path / "crops" / "wine glass").exists()
     assert (own / "view.pcd").exists()
+
+
+def test_exports_at_the_same_time_do_not_repeat_views(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each would miss the views of the other, and objects would be in training and test set."""
+    folder = tmp_path / "copy"
+    shutil.copytree(run, folder)
+    out = tmp_path / "crops"
+    second = Thread(
+        target=export_run, args=(read_finished(folder), "crops", out), kwargs={"every": 4}
+    )
+    replace = crops._replace
+
+    def replace_meanwhile(*places: Any) -> None:
+        if second.ident is None:
+            second.start()
+            second.join(1)
+        replace(*places)
+
+    monkeypatch.setattr(crops, "_replace", replace_meanwhile)
+    count = export_run(read_finished(run), "crops", out, every=4)
+    second.join()
+
+    assert len(list(out.glob("*/*/*.pcd"))) == count > 0
 
 
 @pytest.mark.parametrize("suffix", [pytest.param("", marks=pytest.mark.many), "_full"])

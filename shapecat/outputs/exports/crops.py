@@ -18,6 +18,7 @@ from shapecat.outputs.colouring import PairedFrame
 from shapecat.outputs.level_clouds import upright_cloud, write_pcd
 from shapecat.outputs.wording import different_names, safe_name
 from shapecat.runs.finished import FinishedRun
+from shapecat.system.files import holding
 
 __all__ = ["Origin", "write_crops"]
 
@@ -77,6 +78,13 @@ def write_crops(out: Path, frames: Iterable[PairedFrame], finished: FinishedRun)
     ------
     OutputError : ``out`` is not writable, or holds views of a time range covered only in part.
     """
+    with explained(f"{out}: cannot be written", OutputError):
+        out.mkdir(parents=True, exist_ok=True)
+    with holding(out):  # exports at the same time would not see each other's views
+        return _write_views(out, frames, finished)
+
+
+def _write_views(out: Path, frames: Iterable[PairedFrame], finished: FinishedRun) -> int:
     origin = Origin.of(finished)
     earlier = _earlier_views(out, origin)
     prefix = f"{safe_name(finished.name)}.{origin}"
