@@ -214,9 +214,12 @@ def test_views_are_sorted_by_path(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["mug/0.PCD", "mug/red/left/0.PCD"])
-def test_category_without_folders_of_objects_is_refused(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("in_place", ["cup/a/0.pcd", "mug/a/0.pcd"])
+def test_views_outside_folders_of_objects_are_refused(
+    tmp_path: Path, name: str, in_place: str
+) -> None:
     """Views in too few or too many folders were silently left out if others were in place."""
-    for other in ("cup/a/0.pcd", "cup/scan.ply", name, ".mug/0.pcd"):
+    for other in (in_place, name, ".mug/0.pcd", "mug/.checkpoints/0.pcd", "scan.ply"):
         (tmp_path / other).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / other).touch()
     refused = r"0\.PCD: expected a folder for each object, such as mug/object/0\.PCD"
@@ -225,7 +228,7 @@ def test_category_without_folders_of_objects_is_refused(tmp_path: Path, name: st
         read_dataset(tmp_path)
 
     (tmp_path / name).unlink()
-    assert read_dataset(tmp_path).files == (tmp_path / "cup" / "a" / "0.pcd",)
+    assert read_dataset(tmp_path).files == (tmp_path / in_place,)
 
 
 def test_hidden_files_are_not_views(tmp_path: Path) -> None:

@@ -81,8 +81,8 @@ def read_dataset(root: Path) -> Dataset:
 
     Raises
     ------
-    RecordingError : the folder holds no views, or all views of a category are beside or below the
-        folders of its objects, not in them.
+    RecordingError : the folder holds no views, or a view of a category is beside or below the
+        folders of its objects, not in one.
     """
     files = tuple(_views_among(root, "*/*/*"))
     if not files:
@@ -91,18 +91,17 @@ def read_dataset(root: Path) -> Dataset:
             f"{root.resolve().name}/cup/red_mug/000.pcd (or .ply, .npz)"
         )
         raise RecordingError(msg)
-    categories = {path.parent.parent.name for path in files}
-    folders = {
-        path.name for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")
-    }
-    without_views = sorted(folders - categories)
-    for name in without_views:
-        for path in _views_among(root / name, "**/*"):
-            if path.is_file():
-                place = Path(name, "object", path.name)
+    folders = sorted(
+        path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")
+    )
+    for folder in folders:
+        for path in _views_among(folder, "**/*"):
+            if path.is_file() and path.parent.parent != folder:
+                place = Path(folder.name, "object", path.name)
                 msg = f"{path}: expected a folder for each object, such as {place}"
                 raise RecordingError(msg)
-    return Dataset(files, tuple(without_views))
+    categories = {path.parent.parent.name for path in files}
+    return Dataset(files, tuple(path.name for path in folders if path.name not in categories))
 
 
 def _views_among(root: Path, pattern: str) -> list[Path]:
