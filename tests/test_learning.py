@@ -406,6 +406,16 @@ def test_learning_stores_a_limited_number_of_views(
         assert all(np.any(np.all(row == views, axis=1)) for row in stored)
 
 
+@pytest.mark.parametrize("added", [5, None, {"cone": 1}])
+def test_any_notes_of_a_model_can_be_extended(categorizer: Categorizer, added: Any) -> None:
+    """Model files are untrusted, and notes are not checked: `learn` ended with a traceback."""
+    model = replace(categorizer, notes={"added": added})
+    cone = blobs(20, 7, ("cone",))
+    learned = add_categories(model, cone.descriptors, ["cone"] * 20, rng=np.random.default_rng(0))
+
+    assert learned.notes == {"added": ["cone"]}
+
+
 @pytest.mark.parametrize("left", [[1, 1, 0], [1, 0], [2, 0, 0], [1, 2, 3, 0, 0]])
 def test_cyclic_trees_are_rejected(left: list[int]) -> None:
     """Branches that meet again are rejected, too: their paths double with every level."""

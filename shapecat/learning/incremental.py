@@ -103,6 +103,8 @@ def add_categories(
     leaf_values = np.concatenate([categorizer.leaf_values, learned[z.shape[1] : -1]], axis=1)
     columns = np.argsort(order)[truth]
     stored = choose_evenly(columns, KNOWN_VIEWS, rng)
+    earlier = categorizer.notes.get("added")
+    earlier = earlier if isinstance(earlier, list) else []  # the file may hold anything
     return replace(
         categorizer,
         categories=categories,
@@ -111,7 +113,7 @@ def add_categories(
         bias=np.concatenate([categorizer.bias, learned[-1]])[order],
         known_descriptors=z[stored],
         known_category=columns[stored],
-        notes={**categorizer.notes, "added": [*categorizer.notes.get("added", []), *added]},
+        notes={**categorizer.notes, "added": [*earlier, *added]},
     )
 
 
