@@ -1583,6 +1583,28 @@ def test_coco_image_that_fits_no_frame_or_mask_is_refused(
     assert str(error.value).startswith(reason)
 
 
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"images": [*COCO["images"], COCO["images"][0]]}, "several images have the id 2"),
+        (
+            {"annotations": [{**COCO["annotations"][0], "image_id": "2"}]},
+            "no image has the id of an annotated one, such as '2'",
+        ),
+        (
+            {"categories": [*COCO["categories"], {"id": 4, "name": "can"}]},
+            "cup and can have the same id, 4",
+        ),
+    ],
+)
+def test_coco_ids_that_do_not_tell_items_apart_are_refused(
+    change: dict[str, Any], reason: str
+) -> None:
+    """Merged files repeat ids: masks of one image would count for another, or for none at all."""
+    with pytest.raises(RecordingError, match=f"^a.json: {reason}$"):
+        CocoLabels(Path("a.json"), COCO | change)
+
+
 def test_labels_of_other_frames_are_described_by_their_range(tmp_path: Path) -> None:
     """The error about labels of another recording names what they hold."""
     (tmp_path / "label_2").mkdir()

@@ -1,7 +1,7 @@
 """COCO instance labels on images with the size of the depth images."""
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,11 +61,12 @@ class CocoLabels(Reference[_Image]):
     def __init__(
         self, path: Path, content: Mapping[str, Any], run: str = "", digest: str = ""
     ) -> None:
-        names = {item["id"]: str(item["name"]) for item in content["categories"]}
+        names = _names_of(path, content["categories"])
         annotations = defaultdict(list)
         for item in content["annotations"]:
             annotation = _Annotation(item, names[item["category_id"]], _track_of(item))
             annotations[item["image_id"]].append(annotation)
+        _require_ids(path, [image["id"] for image in content["images"]], list(annotations))
         images = _images_of(run, path, content["images"])
         same = [image for image in images if image.get("digest") == digest]
         images = same or images
@@ -104,6 +105,35 @@ class CocoLabels(Reference[_Image]):
             pixels=np.flatnonzero(mask),
             decidable=not content.get("iscrowd"),
         )
+
+
+def _names_of(path: Path, categories: Sequence[Mapping[str, Any]]) -> dict[Any, str]:
+    """Return the names of the categories by id; raise `RecordingError` if one id has two names."""
+    names: dict[Any, str] = {}
+    for item in categories:
+        name = names.setdefault(item["id"], str(item["name"]))
+        if name != str(item["name"]):
+            msg = f"{path}: {name} and {item['name']} have the same id, {item['id']!r}"
+            raise RecordingError(msg)
+    return names
+
+
+def _require_ids(path: Path, images: Sequence[Any], annotated: Sequence[Any]) -> None:
+    """Check that the ids of images tell which annotations are theirs.
+
+    ``annotated`` are the ids of images that the annotations name. Some may be missing among
+    ``images``, if these are a selection.
+
+    Raises
+    ------
+    RecordingError : two images have the same id, or no image has annotations.
+    """
+    if repeated := [name for name, count in Counter(images).items() if count > 1]:
+        msg = f"{path}: several images have the id {repeated[0]!r}"
+        raise RecordingError(msg)
+    if images and annotated and not {*images} & {*annotated}:
+        msg = f"{path}: no image has the id of an annotated one, such as {annotated[0]!r}"
+        raise RecordingError(msg)
 
 
 def _track_of(item: Mapping[str, Any]) -> int | None:
