@@ -884,6 +884,19 @@ def test_baselines_are_not_tested_on_objects_they_learned(
         evaluate_folder(test, trained, baselines=train)
 
 
+def test_baselines_are_not_tested_on_objects_in_linked_folders(
+    trained: Path, tmp_path: Path
+) -> None:
+    """A training set made of links to the tested views gave figures that were too good."""
+    test = write_dataset(tmp_path / "test", ("ball", "box"), instances=2, seed=4)
+    (tmp_path / "train").mkdir()
+    for name in ("ball", "box"):
+        (tmp_path / "train" / name).symlink_to(test / name)
+
+    with pytest.raises(RecordingError, match=r"is also in .*test"):
+        evaluate_folder(test, trained, baselines=tmp_path / "train")
+
+
 def test_baselines_need_two_objects_of_each_category(trained: Path, tmp_path: Path) -> None:
     """Views of a single object would be in training and test; the error names its category."""
     write_dataset(tmp_path / "data", ("box",), instances=2)

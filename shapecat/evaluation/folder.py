@@ -81,10 +81,10 @@ def _require_other_views(test: Dataset, root: Path, training_set: Path) -> None:
 
     Raises
     ------
-    RecordingError : a view is in both.
+    RecordingError : a view is in both, or the training set has none.
     """
     sizes = {path.stat().st_size for path in test.files}
-    files = (path for path in sorted(training_set.rglob("*")) if path.is_file())
+    files = read_dataset(training_set).files  # also those in linked folders
     others = {_digest(path): path for path in files if path.stat().st_size in sizes}
     for path in test.files:
         if other := others.get(_digest(path)):
