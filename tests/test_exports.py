@@ -212,6 +212,17 @@ def test_exporting_again_removes_views_with_earlier_labels(run: Path, tmp_path: 
     assert (own / "view.pcd").exists()
 
 
+def test_long_categories_of_all_scripts_are_whole_in_crops(run: Path, tmp_path: Path) -> None:
+    """`learn` takes the name of the folder: a cut one is another category than the label."""
+    folder = tmp_path / "table"
+    shutil.copytree(run, folder)
+    names = {2: "椀" * 60, 3: "椀" * 50 + "皿" * 10}
+    relabel(folder, names)
+    export_run(read_finished(folder), "crops", tmp_path / "crops", every=4)
+
+    assert {*names.values()} <= {*read_dataset(tmp_path / "crops").categories}
+
+
 def test_exports_at_the_same_time_do_not_repeat_views(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -57,10 +57,11 @@ def time_span(first_s: float, last_s: float) -> str:
     return f"{last} s" if first == last else f"{first}–{last} s"
 
 
-def safe_name(text: str) -> str:
-    """Return a text as a name for a file or folder: no separators, not hidden, at most 120 bytes.
+def safe_name(text: str, longest: int = _LONGEST_BYTES) -> str:
+    """Return a text as a name for a file or folder: no separators, not hidden, not too long.
 
-    Letters of all scripts stay, with their accents and vowel signs.
+    Letters of all scripts stay, with their accents and vowel signs. The name is cut after
+    ``longest`` bytes.
 
     Examples
     --------
@@ -68,7 +69,7 @@ def safe_name(text: str) -> str:
     '_wine glass'
     """
     safe = (c if _SAFE.match(c) or unicodedata.category(c)[0] == "M" else "_" for c in text)
-    return "".join(safe).strip(". ").encode()[:_LONGEST_BYTES].decode(errors="ignore") or "_"
+    return "".join(safe).strip(". ").encode()[:longest].decode(errors="ignore") or "_"
 
 
 def different_names(texts: Sequence[str]) -> list[str]:

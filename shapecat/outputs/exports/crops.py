@@ -24,6 +24,9 @@ __all__ = ["Origin", "write_crops"]
 
 _INSTANCE = re.compile(r".*\.([0-9a-f]{12})(?:\.([\d.]+)-([\d.]+|inf))?\.track-\d+", re.DOTALL)
 
+_LONGEST_NAME = 255
+"""Maximum length of the name of a folder, bytes: 60 characters of any script, and some accents."""
+
 
 class Origin(NamedTuple):
     """Source and time range of the views of a run, independent of the name of the run.
@@ -100,7 +103,8 @@ def _write_views(out: Path, frames: Iterable[PairedFrame], finished: FinishedRun
                     cloud = upright_cloud(labelled, frame, item)
                     if cloud is None:
                         continue
-                    instance = hidden / safe_name(item.category) / f"{prefix}.track-{item.track}"
+                    category = safe_name(item.category, _LONGEST_NAME)
+                    instance = hidden / category / f"{prefix}.track-{item.track}"
                     instance.mkdir(parents=True, exist_ok=True)
                     stem = f"{names[labelled.topic]}." if len(names) > 1 else ""
                     view = instance / f"{stem}{labelled.index:06d}.pcd"
