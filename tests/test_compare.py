@@ -1402,6 +1402,26 @@ def test_images_of_other_recordings_are_left_out(run: Path) -> None:
     assert {row.true_category for row in renamed.rows} == {None, "last"}
 
 
+def test_other_recordings_without_tracks_do_not_hide_tracking_metrics() -> None:
+    """A data set joins recordings of which only some were labelled with tracks."""
+    square = [[0, 0, 2, 0, 2, 2, 0, 2]]
+    names = ("lab", "yard")
+    content = {
+        "categories": [{"id": 0, "name": "cup"}],
+        "images": [
+            {"id": k, "stamp_ns": START, "recording": name, "width": 5, "height": 3}
+            for k, name in enumerate(names)
+        ],
+        "annotations": [
+            {"image_id": 0, "category_id": 0, "segmentation": square, "track_id": 1},
+            {"image_id": 1, "category_id": 0, "segmentation": square},
+        ],
+    }
+    tracked = [CocoLabels(Path("a.json"), content, name).tracked for name in names]
+
+    assert tracked == [True, False]
+
+
 def test_recordings_of_runs_with_equal_names_are_told_apart(run: Path) -> None:
     """Two batches may each have a run ``lab``; frames of one must not count for the other."""
     head = {"recording": "lab", "topic": "/d", "frame": 0, "width": 10, "height": 10}

@@ -75,7 +75,7 @@ class CocoLabels(Reference[_Image]):
         )
         super().__init__(path, zip(map(_place_of, images), entries, strict=True))
         self.numbered = any(map(_is_numbered, images))
-        tracks = [annotation.track for some in annotations.values() for annotation in some]
+        tracks = [annotation.track for i in images for annotation in annotations[i["id"]]]
         self.tracked = bool(tracks) and None not in tracks
 
     def labelling(self, entry: _Image) -> Labelling:
