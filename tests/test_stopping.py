@@ -257,7 +257,7 @@ def test_message_of_a_failed_part_does_not_outlive_it(capfd: pytest.CaptureFixtu
     assert not stopping.asked()
     with stopping.handling_signals():
         signal.raise_signal(signal.SIGINT)
-    assert "after the frames in progress" in capfd.readouterr().err
+    assert "interrupt again to stop immediately" in capfd.readouterr().err
 
 
 def test_ignored_signal_stays_ignored() -> None:

@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_messages = [b"stopping after the frames in progress; interrupt again to stop immediately\n"]
+_messages = [b"stopping soon; interrupt again to stop immediately\n"]
 """The last one is printed at the first signal."""
 _SHOW_CURSOR = b"\x1b[?25h"
 

@@ -88,6 +88,7 @@ def write_crops(out: Path, frames: Iterable[PairedFrame], finished: FinishedRun)
 
 
 def _write_views(out: Path, frames: Iterable[PairedFrame], finished: FinishedRun) -> int:
+    """Do the work of `write_crops`, while no other export writes to ``out``."""
     origin = Origin.of(finished)
     earlier = _earlier_views(out, origin)
     prefix = f"{safe_name(finished.name)}.{origin}"
