@@ -934,6 +934,16 @@ def test_last_line_of_a_recording_counts(tmp_path: Path) -> None:
     assert FileManifest(path).entries["a"].state == get_args(State)[-1]
 
 
+def test_manifest_with_undecodable_name_is_read_by_other_programs(tmp_path: Path) -> None:
+    """One name that is not UTF-8 would make the whole manifest unreadable, as for pandas."""
+    path, name = tmp_path / "manifest.jsonl", os.fsdecode(b"caf\xe9")
+    FileManifest(path).record([Entry("café", "café.mcap", "planned"), Entry(name, name, "failed")])
+    lines = path.read_text("utf-8").splitlines()
+
+    assert [json.loads(line)["folder"] for line in lines] == ["café", name]
+    assert set(FileManifest(path).entries) == {"café", name}
+
+
 def test_entry_with_zero_tracks_is_not_read_as_unknown(tmp_path: Path) -> None:
     """If zero tracks were read as unknown, the run would be opened again to count them."""
     path = tmp_path / "manifest.jsonl"

@@ -287,7 +287,10 @@ def entries_at(url: str) -> dict[str, Entry]:
 def _line(entry: Entry) -> bytes:
     values = ((name, getattr(entry, name)) for name in _NAMES)
     present = {name: value for name, value in values if value is not None and value != ""}
-    return json.dumps(present, ensure_ascii=False).encode("utf-8", "surrogatepass") + b"\n"
+    try:
+        return json.dumps(present, ensure_ascii=False).encode() + b"\n"
+    except UnicodeEncodeError:  # a path that is not UTF-8; other programs could not read the file
+        return json.dumps(present).encode() + b"\n"
 
 
 def _entries(lines: Iterable[bytes]) -> Iterator[Entry]:
