@@ -40,6 +40,7 @@ from shapecat.runs.jobs import (
     require_model,
     require_other_folder,
     require_start_in_recording,
+    require_unfinished,
     summarize,
     update_place,
 )
@@ -96,11 +97,9 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
         run = describe_run(job, categorizer)
         require_start_in_recording(job, recording)
         streams = choose_streams(recording, job.topics)
-        run["options"]["topics"] = [stream.topic for stream in streams]
+        topics = run["options"]["topics"] = [stream.topic for stream in streams]
         colours = pair_colours(recording, streams, job.color)
-        _log.info(
-            "%s: %s, model %s", job.name, " ".join(run["options"]["topics"]), job.model or "default"
-        )
+        _log.info("%s: %s, model %s", job.name, " ".join(topics), job.model or "default")
         recover(job.folder)
         if made_by_run(job.folder) is not None:
             if not job.overwrite:
@@ -112,6 +111,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             worth_keeping=has_work,
             finish=lambda: keep_last_labels(folder, run, job),
         ) as folder:
+            require_unfinished(job)  # another process may have completed it before the lock
             run = resume(folder, run, job.source, content.result)
             if "perceive" not in run["seconds"]:
                 run = take_over_frames(job.folder, folder, run, job.source, content.result)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -272,6 +273,24 @@ def test_two_runs_cannot_write_same_folder(recording: Path, tmp_path: Path) -> N
 
     process(job, start_second_run)
 
+    assert [path.name for path in tmp_path.iterdir()] == ["table"]
+
+
+def test_run_completed_by_another_process_before_the_lock_is_kept(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two commands started at once must not repeat work, nor replace a run without --overwrite."""
+    job = Job(recording, tmp_path / "table", frame_range=FrameRange(end_s=0.1), rrd=False)
+
+    def complete_by_another(*_: object) -> None:
+        monkeypatch.undo()
+        process(replace(job, frame_range=FrameRange(end_s=0.2)))
+
+    monkeypatch.setattr("shapecat.pipeline.require_resumable", complete_by_another)
+    with pytest.raises(OutputError, match="another process has just completed it"):
+        process(job)
+
+    assert read_run(job.folder)["options"]["end_s"] == 0.2
     assert [path.name for path in tmp_path.iterdir()] == ["table"]
 
 

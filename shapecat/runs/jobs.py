@@ -15,7 +15,7 @@ from shapecat.learning import Categorizer
 from shapecat.recordings import Recording
 from shapecat.recordings.files import input_size
 from shapecat.recordings.frames import ALL_FRAMES, FrameRange
-from shapecat.runs.folder import clear
+from shapecat.runs.folder import clear, made_by_run
 from shapecat.runs.identity import (
     ContentDigest,
     file_stats,
@@ -37,6 +37,7 @@ __all__ = [
     "require_model",
     "require_other_folder",
     "require_start_in_recording",
+    "require_unfinished",
     "summarize",
     "update_place",
 ]
@@ -265,6 +266,18 @@ def require_other_folder(job: Job) -> None:
                 "--out"
             )
             raise OutputError(msg)
+
+
+def require_unfinished(job: Job) -> None:
+    """Check that there is no complete run, unless the job overwrites it.
+
+    Raises
+    ------
+    OutputError : another process has completed the run folder.
+    """
+    if not job.overwrite and made_by_run(job.folder) is not None:
+        msg = f"{job.folder}: another process has just completed it; run the same command again"
+        raise OutputError(msg)
 
 
 def require_model(job: Job, categorizer: Categorizer) -> None:
