@@ -76,10 +76,11 @@ def measure_frame(depth: Array) -> Figures:
 
 
 def _roughness(inverse: Array, width: int) -> float:
-    """Return the standard deviation of the inverse depth from planes in quiet windows, 1/m.
+    """Return the noise of planes: a quantile, over windows, of the deviation from a plane, 1/m.
 
-    ``inverse`` (h, w) is 0 where there is no depth; a window is ``width`` pixels wide. The result
-    is NaN if no window has enough depth.
+    It is the `QUIETEST` quantile of the standard deviations of inverse depth from the plane fitted
+    to each window, ``width`` pixels wide; NaN if no window has depth in more than 99 % of its
+    pixels. ``inverse`` (h, w) is 0 where there is no depth.
     """
     v, u = np.mgrid[:width, :width].reshape(2, -1) - width / 2
     design = np.column_stack([u, v, np.ones(width * width)])

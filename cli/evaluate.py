@@ -22,7 +22,8 @@ from .render import note_off_support, print_json, progress_bars
     metavar="TRAINING_SET",
     help="Also train shapecat's classifier and the baselines on TRAINING_SET and test them on "
     "DATASET. The two must have no view in common, unless they are the same folder: then shapecat "
-    "cross-validates by instance in up to five folds, and each category needs two instances.",
+    "cross-validates in up to five folds, with all views of an instance in one of them, and each "
+    "category needs two instances.",
 )
 @json_option
 def evaluate(

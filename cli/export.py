@@ -58,10 +58,13 @@ _NO_VAL = (
 @click.option(
     "--corrected-only",
     is_flag=True,
-    help="coco, yolo: only objects whose track a person has labelled count as reliable.",
+    help="coco, yolo: only objects whose track a person has labelled count as reliable, see "
+    "--min-confidence.",
 )
 @click.option(
-    "--depth", is_flag=True, help="coco, yolo: export 16-bit depth images instead of colour images."
+    "--depth",
+    is_flag=True,
+    help="coco, yolo: export 16-bit depth images (millimetres) instead of colour images.",
 )
 @click.option(
     "--val",

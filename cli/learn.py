@@ -25,7 +25,7 @@ def learn(
     MODEL is a model file, or `default` for the model that comes with shapecat. What the model
     has learned about its own categories is kept. DATASET is laid out as for `shapecat train`;
     `shapecat export --format crops` writes such a data set. Views of `unknown` are not used;
-    views of categories that the model knows are counterexamples.
+    views of categories that the model knows are negative examples.
 
     \b
     shapecat learn default crops --out mine.npz

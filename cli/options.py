@@ -85,7 +85,7 @@ model_option = click.option(
     "--model",
     type=ANY_PATH,
     callback=none_if_default,
-    help="Model file; if not given, or `default`, the model that comes with shapecat.",
+    help="Model file; without it, or with `default`, the model that comes with shapecat is used.",
 )
 
 

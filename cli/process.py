@@ -80,8 +80,8 @@ if TYPE_CHECKING:
 @click.option(
     "--shard",
     metavar="I/N",
-    help="Process only part I of N, for job arrays. I is 1 to N, or 0 to N-1: 0/N is the same "
-    "part as N/N.",
+    help="Process only part I of N of the recordings, for job arrays. I may count from 1 or from "
+    "0: 0/N is the same part as N/N.",
 )
 @choice_option(
     "--progress",
@@ -90,7 +90,9 @@ if TYPE_CHECKING:
     "shows bars on a terminal, else plain lines.",
 )
 @click.option(
-    "--color", metavar="TOPIC", help="Topic of colour images; by default that of each depth camera."
+    "--color",
+    metavar="TOPIC",
+    help="Topic of the colour images for all depth cameras; by default, each has its own.",
 )
 @click.option("--no-color", is_flag=True, help="Do not use colour images.")
 @boxes_option("In annotated.mcap, {}; full by default.")

@@ -10,7 +10,11 @@ from .options import ANY_PATH
 @click.command()
 @click.argument("run", type=ANY_PATH)
 @click.option(
-    "--frame", type=click.IntRange(0), required=True, metavar="N", help="Frame number, from 0."
+    "--frame",
+    type=click.IntRange(0),
+    required=True,
+    metavar="N",
+    help="Number of the frame on its topic, from 0.",
 )
 @click.option("--topic", metavar="TOPIC", help="Topic of the frame, if the run has several.")
 def scene(*, run: Path, frame: int, topic: str | None) -> None:

@@ -880,7 +880,7 @@ def test_tilted_top_face_does_not_replace_the_table() -> None:
     """Extended to below the camera, its plane is the lower of the two."""
 
     def wedge(origin: Array, rays: Array) -> Array:
-        """Return the depth of a face that rises by 4 degrees, from 3 cm above the table."""
+        """Return the depth of a face that rises at 4 degrees, from 3 cm above the table."""
         t = (0.037 + 0.07 * origin[1] - origin[2]) / (rays[..., 2] - 0.07 * rays[..., 1])
         point = origin + t[..., None] * rays
         return np.where((abs(point[..., :2]) < 0.11).all(axis=-1), t, np.inf)

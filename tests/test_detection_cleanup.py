@@ -270,7 +270,7 @@ def test_mouth_of_cup_seen_from_above_is_filled(width: int, torn: int, filled: b
 def test_table_between_the_parts_of_a_drill_is_not_a_hole() -> None:
     """Motor, grip and base enclose it on three sides, and it is larger than they are.
 
-    It would make the drill a quarter wider, and another shape.
+    It would make a real drill 25 instead of 18 cm wide.
     """
     inv_depth = np.full((40, 40), 1.25, np.float32)
     labels, filled = np.zeros((40, 40), np.int16), np.zeros((40, 40), np.uint8)

@@ -194,7 +194,7 @@ def test_worker_without_listener_does_not_survive(monkeypatch: pytest.MonkeyPatc
 
 
 def test_fewer_threads_than_workers_do_all_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the process limit, a batch would end with a traceback."""
+    """Otherwise, a batch would end with a traceback at the process limit."""
     _refuse_threads(monkeypatch, "LocalExecutor._dispatch", allowed=1)
 
     with LocalExecutor(2) as executor:

@@ -516,7 +516,7 @@ def several_runs(run: Path, results: Path) -> None:
 def test_runs_with_errors_are_named_and_skipped(
     shapecat: Run, run: Path, tmp_path: Path, kind: str
 ) -> None:
-    """An export of many runs exported none if the recording of one had been moved."""
+    """A moved recording or an unusable table must not stop the export of the other runs."""
     results, out = tmp_path / "results", tmp_path / "out"
     several_runs(run, results)
     result = shapecat("export", results, "--format", kind, "--out", out, "--every", 6)

@@ -279,7 +279,10 @@ def test_objects_that_swap_places_are_distinguished_by_time(tmp_path: Path) -> N
 def test_large_objects_are_matched_over_larger_distances_at_once(
     tmp_path: Path, size: float, other: float, *, matched: bool
 ) -> None:
-    """Other settings may find another part of a box: up to half of its mean width is allowed."""
+    """Other settings may find another part of a box.
+
+    So the centres may be half as far apart as the two detections are wide on average.
+    """
     source = make_run(tmp_path / "source", {1: static(CUP)}, labels={1: "mug"}, size=size)
     target = make_run(tmp_path / "target", {5: static(shifted(CUP, y=0.07))}, size=other)
 

@@ -168,8 +168,9 @@ def _follow_in_time(paths: Sequence[Path]) -> bool:
 def _search(folder: Path, searched: set[Path]) -> Iterator[Path]:
     """Yield the recordings below a folder; each folder is sorted by name, symbolic links last.
 
-    Folders in ``searched`` (resolved paths; updated in place) are left out, so links may form
-    loops. A folder that may not be read, such as ``lost+found``, is skipped, and the log says so.
+    Runs and hidden entries are left out, and so are folders in ``searched`` (resolved paths;
+    updated in place), which makes loops of links harmless. A folder that may not be read, such as
+    ``lost+found``, is skipped, and the log says so.
     """
     real = _real_path(folder)
     if real in searched:

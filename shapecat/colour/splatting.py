@@ -122,9 +122,9 @@ def _splat(
 
 @kernel(inner=True)
 def _sample_background(depth: F4, pixels: U4) -> U4:
-    """Return every `_SPARSE`-th pixel of every `_SPARSE`-th row that has depth and is not listed.
+    """Return the pixels on every `_SPARSE`-th row and column with depth that are not in ``pixels``.
 
-    ``pixels`` (n,) lists flat indices into ``depth``, and so does the result (k,).
+    Both ``pixels`` (n,) and the result (k,) are flat indices into ``depth`` (h, w).
     """
     rows, columns = (depth.shape[0] - 1) // _SPARSE + 1, (depth.shape[1] - 1) // _SPARSE + 1
     outside = np.ones((rows, columns), np.bool_)

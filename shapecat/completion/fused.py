@@ -143,10 +143,10 @@ def _near(centers: F8, place: F8) -> Bool:
 
 
 def _not_turned(axes: F8, sizes: F8, weights: F8) -> Bool:
-    """Return in which views (k,) an object that stands in one place has its most common yaw.
+    """Return which views (k,), in order of time, show the yaw with the largest total weight.
 
-    These are all views if no yaw is steady. ``axes`` (k, 3, 3) and ``sizes`` (k, 3) are as in
-    `BoxViews`; ``weights`` (k,) are the views'.
+    They are all views if the yaw is never steady. The object stands in one place; ``axes``
+    (k, 3, 3) and ``sizes`` (k, 3) are as in `BoxViews`, ``weights`` (k,) are those of the views.
     """
     result = np.ones(len(axes), np.bool_)
     best_weight, elongation = 0.0, _elongation(sizes)

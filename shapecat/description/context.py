@@ -116,7 +116,7 @@ def context(
     normals, curvatures : (3, k) and (2, k), from `fit_surfaces`.
     upright : from `vertical_axis`.
     low, high : 2nd and 98th percentiles of the heights of the points, in units of the surface.
-    out : the part ``context`` of the descriptor, zeros on entry, written in place.
+    out : the block ``context`` of the descriptor, zeros on entry, written in place.
 
     Returns
     -------

@@ -39,7 +39,7 @@ def outline(cloud: F4, eye: F4, out: F4) -> None:
     ----------
     cloud : (3, n) points, z up, in units of the mean distance between neurons.
     eye : (3,) position of the sensor in the same frame.
-    out : the part ``outline`` of the descriptor, zeros on entry, written in place;
+    out : the block ``outline`` of the descriptor, zeros on entry, written in place;
         slices without points stay 0.
     """
     across, upward = _image(cloud, eye)

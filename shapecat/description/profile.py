@@ -89,7 +89,7 @@ def profile(
     normals, curvatures : (3, n) and (2, n), from `fit_surfaces`.
     upright : from `vertical_axis`.
     low, high : 2nd and 98th percentiles of the heights of the points, in units of the surface.
-    out : the part ``profile`` of the descriptor, zeros on entry, written in place.
+    out : the block ``profile`` of the descriptor, zeros on entry, written in place.
     """
     x, y, z = surface.neurons[0], surface.neurons[1], surface.neurons[2]
     weight = surface.weight

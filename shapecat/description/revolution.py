@@ -47,7 +47,7 @@ def revolution(surface: Surface, normals: F4, axis: F8, point: F8, foot: F8, out
     normals : (3, k) from `fit_surfaces`.
     axis, point : (3,) first guess of the tilted axis, from `rotation_axis`; overwritten.
     foot : (3,) a point on the vertical axis, the first guess; overwritten.
-    out : the part ``revolution`` of the descriptor, written in place.
+    out : the block ``revolution`` of the descriptor, written in place.
     """
     cloud, owner, neurons = surface.points, surface.nearest, surface.neurons
     weight, eye = surface.weight, surface.eye

@@ -61,7 +61,7 @@ def solids(
     eye : (3,) position of the sensor.
     low, high : 2nd and 98th percentiles of the heights of the points.
     revolved : the block ``revolution``, already written.
-    out : the part ``solids`` of the descriptor, written in place.
+    out : the block ``solids`` of the descriptor, written in place.
     """
     u, v = _box_frame(cloud, x, y, normals, eye)
     _box(u, v, cloud[2], owner, normals, low, high, out[:13])

@@ -80,9 +80,11 @@ class Report:
     skipped : number of views with too few points for a surface.
     off_support : categories whose objects, in most views, do not stand at z = 0.
     by_distance, by_points, by_elevation : (range, views, accuracy) over the distance in metres, the
-        number of voxels, and the elevation of the sensor in degrees.
+        number of voxels, and the elevation of the sensor as seen from the object, degrees.
     fused : accuracy after fusing several views; empty if no object has three views.
-    baselines : results of other classifiers; empty unless requested.
+    baselines : results of shapecat's classifier and of the baselines, trained on the same views;
+        empty unless requested.
+    calibration : number of views, mean confidence and accuracy in bins of confidence.
     """
 
     model: str

@@ -194,10 +194,11 @@ def count_labels(pixel_labels: U1, labels: I4, grid: DepthGrid) -> I4:
 
 
 def _segment_objects(segments: Segments, counts: I4, object_labels: I4) -> tuple[I4, I4]:
-    """Return the number of cells (n,) of each merged segment, and the object (n,) that it shows.
+    """Return, for each segment (n,), the number of cells merged into it, and the object it shows.
 
-    An object is given by its label; 0 is background, and -1 a segment that mixes several.
-    ``counts`` are from `count_labels`; ``object_labels`` (k,) are the pixel labels of objects.
+    An object is given by its label; 0 is background, and -1 a segment of which none owns more than
+    `_PURE`. Segments that were merged into another have 0 cells and -1. ``counts`` are from
+    `count_labels`; ``object_labels`` (k,) are the pixel labels of objects.
     """
     joined = np.zeros_like(counts)
     np.add.at(joined, segments.parent, counts)

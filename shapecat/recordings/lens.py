@@ -62,7 +62,7 @@ class _Lens(NamedTuple):
 
 @lru_cache(maxsize=4)  # the calibration of a camera hardly ever changes
 def _lens_of(camera: Camera, model: str, coefficients: tuple[float, ...]) -> _Lens | None:
-    """Compute the rays of a lens; return None if its distortion cannot be inverted."""
+    """Compute the geometry of a lens; return None if its distortion cannot be inverted."""
     rays = undistorted_rays(camera, model, coefficients)
     if rays is None:
         return None

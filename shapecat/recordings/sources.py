@@ -57,7 +57,7 @@ class FrameSource:
 
     @contextmanager
     def counting(self) -> Iterator[None]:
-        """Within the block, count unreadable messages by reason instead of raising errors."""
+        """If the message read in the block is unreadable, count it by reason instead of raising."""
         try:
             yield
         except (MessageError, *MALFORMED) as error:

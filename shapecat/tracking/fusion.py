@@ -112,7 +112,10 @@ def fuse_novelty(novelties: ArrayLike, weights: ArrayLike) -> float:
 
 
 def _evidence(views: F8, method: str) -> F8:
-    """Return the terms (k, c) that are summed over the views: posteriors, logarithms or votes."""
+    """Return the terms (k, c) that are summed over the views, given their posteriors (k, c).
+
+    They are the posteriors (``mean``), their logarithms (``product``) or votes (``vote``).
+    """
     if method == "mean":
         return views
     if method == "product":

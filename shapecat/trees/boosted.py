@@ -41,7 +41,7 @@ def read_trees(content: bytes, features: np.dtype[Any]) -> BoostedTrees:
 
 
 def write_trees(path: Path, ensemble: BoostedTrees, features: np.dtype[Any]) -> None:
-    """Write trees to a file, with the names of the fields of ``features``; these may be nested."""
+    """Write trees to a file, with the names of their ``features``, nested as ``outer.inner``."""
     names = np.array(list(_names(features)))
     np.savez_compressed(path, **ensemble.trees._asdict(), value=ensemble.value, names=names)
 

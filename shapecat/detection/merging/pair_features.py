@@ -211,7 +211,10 @@ def write_pair_features(
 
 @kernel(inline=True)
 def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) -> None:
-    """Write the features of the border between segments p and q; a cell is ``cell`` metres wide."""
+    """Write the `_ADJACENCY` features of the first segment p and the second, q, to ``out``.
+
+    A cell is ``cell`` metres wide.
+    """
     pair, reverse = segments.pairs[p, q], segments.pairs[q, p]
     border = pair.contact + pair.near + pair.in_front + reverse.in_front
     surface = pair.contact + pair.near

@@ -133,7 +133,7 @@ def _accuracy(pairs: Sequence[tuple[str, str]]) -> float | None:
 
 
 def _balanced(pairs: Sequence[tuple[str, str]]) -> float | None:
-    """Return the mean recall of the true categories in (true, given) pairs; None without pairs."""
+    """Return the mean recall of the true categories in (true, assigned) pairs; None if empty."""
     names = sorted({true for true, _ in pairs})
     recalls = [_accuracy([pair for pair in pairs if pair[0] == name]) for name in names]
     return _mean([value for value in recalls if value is not None])

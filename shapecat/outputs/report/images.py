@@ -304,7 +304,7 @@ def _inside(mask: Bool, window: Window, shape: Sequence[int]) -> Bool:
 
 
 def crop_of(image: FramePicture, number: int) -> Crop:
-    """Return the picture of an object in a frame; ``number`` is its index, from 0."""
+    """Return the picture of an object in a frame; ``number`` is its index in ``image.masks``."""
     mask = image.masks[number]
     window = _window(image, mask)
     uri, width, height = encode(np.asarray(_cut(image, window)), quality=82)

@@ -169,7 +169,7 @@ class McapRecording(ChunkedRecording):
     def _split(self, record: Record, end: int | None = None) -> Iterator[RawMessage]:
         """Yield the messages in the first ``end`` decompressed bytes of a chunk; None for all.
 
-        Damage or truncation ends the messages, with one warning per chunk.
+        They end at damage or truncation, with one warning per chunk.
         """
         try:
             for opcode, content in split_chunk(self._plain(record, end)):

@@ -284,7 +284,7 @@ def has_labels(path: Path) -> bool:
 
 
 def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:
-    """Return a table with the labels and line numbers in ``rows``, for the tracks listed there."""
+    """Return ``base`` with the labels and line numbers of ``rows``; other tracks keep theirs."""
     edited = {row.track: row for row in rows}
     changed = [
         replace(with_label(row, edited[row.track].label), line=edited[row.track].line)

@@ -69,8 +69,8 @@ class _Stream:
 def explain_colour_offsets(folder: Path) -> Iterator[str]:
     """Yield a warning for each topic whose masks may be displaced on colour images.
 
-    The motion of the camera between the two images of a frame is corrected if transforms give it;
-    that of objects is not.
+    The motion of the camera between the depth image and the colour image of a frame is corrected
+    if transforms give it; that of objects is not.
 
     Parameters
     ----------

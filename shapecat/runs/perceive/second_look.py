@@ -122,9 +122,9 @@ def _fixed_up(stream: _Stream, posed: Bool) -> F8:
 
 
 def _still_up(stream: _Stream) -> F8:
-    """Return, for each frame, the up direction (n, 3) on which the nearby frames agree.
+    """Return the up direction (n, 3), sensor frame, on which the frames around each frame agree.
 
-    It is NaN if they are too few, or do not agree, since the camera moved.
+    It is NaN where these are too few, or disagree, as when the camera moves.
     """
     has_plane, expected = stream.has_plane, np.full(stream.up.shape, np.nan)
     for k in range(len(expected)):
