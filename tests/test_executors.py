@@ -432,6 +432,24 @@ def test_dask_runs_equal_calls_separately() -> None:
         assert first.result() != second.result()
 
 
+def test_result_that_dask_cannot_fetch_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If the scheduler was killed while a result was fetched, the batch never ended."""
+    distributed = pytest.importorskip("distributed")
+    client = distributed.Client(processes=False, n_workers=1, dashboard_address="127.0.0.1:0")
+
+    async def lose(**_: object) -> None:
+        raise distributed.comm.CommClosedError
+
+    with _DaskExecutor(client, None) as executor:
+        with monkeypatch.context() as patched:
+            patched.setattr(client.scheduler, "gather", lose, raising=False)
+            error = executor.submit(abs, -3).exception(timeout=60)
+
+        assert error is not None
+        assert is_lost(error)
+        assert executor.submit(abs, -3).result(timeout=60) == 3
+
+
 def test_dask_without_a_worker_is_known_to_wait() -> None:
     """While no worker had started, the command waited without saying why."""
     distributed = pytest.importorskip("distributed")
@@ -455,13 +473,10 @@ def test_lost_dask_scheduler_is_a_known_error(status: str) -> None:
     class ClosedClientError(Exception):
         """Stands for the error of `distributed.client`."""
 
-    def cancel(*, wait: bool) -> None:
-        raise ClosedClientError(wait)
+    def refuse(*_: object, **__: object) -> None:
+        raise ClosedClientError
 
-    executor = SimpleNamespace(submit=lambda *_: Future(), shutdown=cancel)
-    client: Any = SimpleNamespace(
-        get_executor=lambda **_: executor, status=status, close=lambda **_: None
-    )
+    client: Any = SimpleNamespace(submit=refuse, status=status, close=lambda **_: None)
 
     with (
         pytest.raises(ShapecatError, match=r"scheduler is gone.*run the same command"),

@@ -1,7 +1,8 @@
-"""Adapter for Dask, whose client already has the interface of `concurrent.futures`."""
+"""Adapter for Dask."""
 
 import logging
 from concurrent.futures import Future
+from concurrent.futures import wait as wait_for
 from contextlib import suppress
 from typing import Any
 
@@ -17,23 +18,33 @@ _CLOSE_S = 10
 
 
 class _DaskExecutor(WorkerExecutor):
-    """The executor of a Dask client; it also closes the client, and the cluster started here."""
+    """Runs calls through a Dask client; closes the client, and the cluster started here.
+
+    The client's own executor is not used: if the scheduler is lost while it fetches a result, the
+    future of that result never ends.
+    """
 
     def __init__(self, client: Any, cluster: Any) -> None:
         self._client, self._cluster = client, cluster
-        # Not pure: a second attempt must not return the result of the first.
-        self._executor = client.get_executor(pure=False)
+        self._futures: set[Future[Any]] = set()
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submit a call; raise `ShapecatError` if the scheduler was lost and did not come back."""
         if self._is_cut_off():
             msg = "the Dask scheduler is gone: start it again, and run the same command again"
             raise ShapecatError(msg)
-        future: Future[Any] = self._executor.submit(fn, *args, **kwargs)
+        # Not pure: a second attempt must not return the result of the first.
+        task = self._client.submit(fn, *args, pure=False, **kwargs)
+        future: Future[Any] = Future()
+        self._futures.add(future)
+        future.add_done_callback(self._futures.discard)
+        self._client.loop.add_callback(_deliver, task, future)
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
-        self._executor.shutdown(wait=wait and not cancel_futures)  # cancels if it does not wait
+        """Wait for the calls if asked to, and close the client, which cancels the others."""
+        if wait and not cancel_futures:
+            wait_for(self._futures.copy())
         self._close(_CLOSE_S)
 
     def lacks_workers(self) -> bool:
@@ -42,8 +53,6 @@ class _DaskExecutor(WorkerExecutor):
 
     def terminate(self) -> None:
         """Cancel waiting tasks, and end the workers started here."""
-        if not self._is_cut_off():
-            self._executor.shutdown(wait=False)
         self._close(1)
 
     def _is_cut_off(self) -> bool:
@@ -55,6 +64,16 @@ class _DaskExecutor(WorkerExecutor):
             if each is not None:
                 with suppress(TimeoutError):
                     each.close(timeout=timeout_s)
+
+
+async def _deliver(task: Any, future: Future[Any]) -> None:
+    """Wait for a task of Dask, and give its result or error to ``future``."""
+    try:
+        result = await task
+    except BaseException as error:  # noqa: BLE001  also a cancellation, which is a lost scheduler
+        future.set_exception(error)
+    else:
+        future.set_result(result)
 
 
 def open_dask(workers: int, address: str | None) -> WorkerExecutor:
