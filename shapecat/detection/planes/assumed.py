@@ -15,7 +15,7 @@ from shapecat.detection.planes.settings import ASSUMED, PLANES, UP
 __all__ = ["assume_plane", "find_unexplained"]
 
 SAMPLE_STRIDE = 4
-"""Step between the unexplained samples that determine the height and extent of the plane."""
+"""One in this many unexplained samples is used to determine the height and extent of the plane."""
 
 
 def find_unexplained(grid: DepthGrid, explained: I4 | U1) -> Bool | None:

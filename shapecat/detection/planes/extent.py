@@ -28,6 +28,7 @@ DIRECTIONS = 16
 """Number of sides of the convex outline of a plane."""
 ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 COS, SIN = np.cos(ANGLES), np.sin(ANGLES)
+"""Components along x and y of the directions of `SupportingPlane.extent`, level frame."""
 APART = 3
 """Distance, in cells, from the first or last inlier of a row to neighbours that extend the outline
 if they lie on the plane."""
@@ -106,7 +107,7 @@ def area_of(inliers: DepthSamples, plane: F8, distance: float) -> float:
 
 @kernel(inline=True)
 def _ends(inliers: DepthSamples, rows: int, columns: int) -> I4:
-    """Return first and last inlier column of each row, (2, rows); the last is -1 if none."""
+    """Return the first and last inlier column of each row, (2, rows); the last is -1 if none."""
     ends = np.zeros((2, rows), np.int32)
     for i in range(rows):
         ends[0, i], ends[1, i] = columns, -1
@@ -119,6 +120,8 @@ def _ends(inliers: DepthSamples, rows: int, columns: int) -> I4:
 @kernel(inline=True)
 def _extent_of(grid: DepthGrid, plane: F8, normal: F8, ends: I4) -> F8:
     """Return the `SupportingPlane.extent` of a plane, enlarged by `PLANES.margin_m`.
+
+    Without inliers, it is -inf.
 
     Perspective keeps a convex outline convex, so only the ends of each row are used, with those of
     their neighbours at the distance `APART` that lie on the plane. ``plane`` (3,) is a, b, c of its

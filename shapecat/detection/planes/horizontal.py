@@ -67,7 +67,11 @@ def _measure_candidates(
 
 
 def _common_up(candidates: list[PlaneCandidate]) -> F8:
-    """Return the mean normal, a unit vector (3,), weighted by precision: area * width²."""
+    """Return the mean normal of the planes, a unit vector (3,).
+
+    It is weighted by the precision of each normal: visible area times squared width, which is the
+    width of the outline in its narrowest direction.
+    """
     half = DIRECTIONS // 2
     mean = np.zeros(3)
     for plane, *_ in candidates:
@@ -133,7 +137,10 @@ def fit_peaks(
 
 
 def _histogram_peak(heights: F4) -> np.float64:
-    """Return the middle of the bin that holds the most heights, with half of its neighbours'."""
+    """Return the middle of the bin with the most heights, metres.
+
+    Heights in the two bins beside it count half. ``heights`` (n,) are in metres.
+    """
     low = heights.min().astype(np.float64)
     bins = ((heights - low) / PLANES.bin_m).astype(np.int64)
     count = np.concatenate([[0], np.bincount(bins), [0]])
@@ -145,9 +152,10 @@ def _histogram_peak(heights: F4) -> np.float64:
 def _fit(
     samples: DepthSamples, intrinsics: PinholeIntrinsics, up: F8, trials: F8, offset: float
 ) -> tuple[F8, bool]:
-    """Fit a plane (3,) to samples at about one height; return it, and whether it is large enough.
+    """Fit a plane to samples at about one height.
 
-    ``offset`` is that height above the sensor, metres; ``up`` and ``trials`` are as in `fit_peaks`.
+    Returns the plane (a, b, c), and whether it has enough inliers and visible area. ``offset`` is
+    that height above the sensor, metres; ``up`` and ``trials`` are as in `fit_peaks`.
     """
     level = horizontal_plane(intrinsics, up, offset)
     plane = level.copy()

@@ -20,9 +20,10 @@ FIRST = STRIDE // 2
 
 
 class OrientedPoints(NamedTuple):
-    """Every third row and column of a depth grid, with normals; n = rows * columns, row by row.
+    """Every third row and column of a depth grid, with normals.
 
-    The points at the edge of the grid have neither a normal nor a position: both are 0.
+    The n = rows * columns points are listed row by row. Those at the edge of the grid have neither
+    a normal nor a position: both are 0.
 
     Attributes
     ----------
@@ -82,7 +83,8 @@ def _orient_row(
     """Write the points of a row; return the number on smooth surface. The loop vectorises.
 
     ``bend`` is the largest second difference of the inverse depth on a smooth surface, 1/m. The row
-    is ``r`` of ``coarse``; its rays are (``x`` (columns,), ``y``, 1); ``focal`` is fx and fy.
+    has the index ``r`` in ``coarse``; the rays of its points are (x, y, 1), where ``y`` is the same
+    for all and ``x`` is (columns,); ``focal`` is fx and fy.
     ``normals`` and ``positions`` are as in `_orient`.
     """
     zero, one, two = np.float32(0), np.float32(1), np.float32(2)

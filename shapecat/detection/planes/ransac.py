@@ -26,7 +26,8 @@ MIN_DOUBLE_AREA = 30.0
 """Twice the minimum area of the triangle of three samples, in square cells. Noise spoils the planes
 of smaller triangles."""
 SAMPLE = 4800
-"""Approximate number of samples for RANSAC: more only take longer."""
+"""Approximate number of cells among which `sample_grid` looks for samples: with more, RANSAC only
+takes longer."""
 
 
 @kernel
@@ -64,7 +65,7 @@ def select_outliers(samples: DepthSamples, plane: F8, tolerance: float) -> Depth
 
 
 def draw_trials(rng: np.random.Generator) -> F8:
-    """Draw random numbers (n, 3) in [0, 1), which pick the samples in all searches of a frame."""
+    """Draw random numbers (n, 3) in [0, 1), to pick the samples in all RANSAC runs of a frame."""
     return rng.random((TRIALS, 3))
 
 
@@ -85,8 +86,8 @@ def ransac_plane(
     ----------
     trials : (n, 3) from `draw_trials`; each row picks three samples that propose a plane.
     guide : (3,) unit vector, sensor frame.
-    cosines : bounds of the cosine between ``guide`` and the plane's normal towards the camera;
-        other planes are not considered.
+    cosines : bounds, inclusive, of the cosine between ``guide`` and the plane's normal towards the
+        camera; other planes are not considered.
     tolerance : largest distance of an inlier in inverse depth, 1/m.
     """
     plane, best = np.zeros(3), np.zeros(3)
@@ -119,8 +120,9 @@ def ransac_plane(
 
 @kernel(inline=True)
 def _propose(samples: DepthSamples, trials: F8, t: int, plane: F8) -> bool:
-    """Write the plane through the samples of trial t; return whether they are far enough apart.
+    """Write the plane through the three samples of trial ``t``, an index into ``trials``.
 
+    Returns whether the triangle of these samples has at least the area of `MIN_DOUBLE_AREA`.
     ``plane`` (3,) is a, b, c of inverse depth; ``trials`` are from `draw_trials`.
     """
     n = samples.inverse_depth.size

@@ -104,7 +104,7 @@ class StripSettings(NamedTuple):
     """Height of a bin, metres: the noise of strips at 1 m."""
     grazing: float = 0.015
     """Change of inverse depth per cell, 1/m, above which a plane is seen at a grazing angle: from
-    one cell to the next it exceeds the tolerance."""
+    one cell to the next, the change exceeds the tolerance."""
     min_slope: float = 0.03
     """Smallest downward slope of a ray (down / forward); flatter rays run along a surface."""
     min_rise: float = 0.05

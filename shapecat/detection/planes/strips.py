@@ -29,9 +29,9 @@ from shapecat.jit import kernel, unset
 __all__ = ["add_strip_planes", "may_have_strips"]
 
 COLUMN_STRIDE = 2
-"""Step between the columns of the samples used."""
+"""Step between the columns that are searched for samples on level surface."""
 AREA_STRIDE = 4
-"""Step between the samples that measure the area above a plane."""
+"""One in this many samples on level surface is used to measure the area above a plane."""
 ARM = 2
 """Distance, in cells, to the neighbours that show whether a sample is on level surface."""
 BINS = 600
@@ -56,9 +56,10 @@ def _may_be_strips(
 ) -> bool:
     """Return whether a plane at a height may be seen as strips: at a grazing angle, or covered.
 
-    The former is ruled out by a large candidate at its height, the latter also by one below it.
-    ``height`` is above the sensor, metres; ``above`` is the level area just above the plane,
-    relative to the area of the plane, as `_peaks` yields it. ``candidates`` are parallel planes.
+    A plane at a grazing angle must have no large candidate at its height, a covered plane also none
+    up to `PlaneSettings.max_object_m` below it. ``height`` is above the sensor, metres; ``above``
+    is the level area just above the plane, relative to the area of the plane, as `_peaks` yields
+    it. ``candidates`` are parallel planes.
     """
     large = [plane.offset for plane, *_ in candidates if plane.area_m2 > PLANES.likely_m2]
     up = candidates[0].plane.up
@@ -193,8 +194,8 @@ def _peaks(amount: F8, threshold: float) -> Iterator[tuple[float, float]]:
 def _count_by_height(points: OrientedPoints, up: F8) -> F8:
     """Count the points below the sensor by height, except those that face sideways.
 
-    The result is (BINS,); a bin is `STRIPS.bin_m` high, and the last one ends at the sensor. ``up``
-    (3,) is a unit vector, sensor frame.
+    Points without a normal count too. The result is (BINS,); a bin is `STRIPS.bin_m` high, and the
+    last one ends at the sensor. ``up`` (3,) is a unit vector, sensor frame.
     """
     x, y, z = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
     xs, ys, zs = points.positions[0], points.positions[1], points.positions[2]
@@ -241,8 +242,8 @@ def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple
 def _find_level(inv_depth: F4, i: int, slope: tuple[float, float, float], level: Bool) -> None:
     """Mark the cells of row i that are on level surface. The loop vectorises.
 
-    ``slope`` is the component along up of the ray at depth 1 through column 0 of the row, and how
-    much it changes from one column, and from one row, to the next. ``inv_depth`` is (rows,
+    ``slope`` holds the component along up of the ray (x, y, 1) through column 0 of the row, and its
+    change from one column to the next and from one row to the next. ``inv_depth`` is (rows,
     columns), 1/m. ``level`` (columns,) is written, except for `ARM` columns at each end.
     """
     start, across, down = slope

@@ -110,7 +110,7 @@ def _is_top(
 
 
 def _is_centred_on(lower: SupportingPlane, upper: SupportingPlane) -> bool:
-    """Return whether the middle (Steiner point) of ``upper`` is inside ``lower``, from above."""
+    """Return whether the middle (Steiner point) of ``upper`` is over the inside of ``lower``."""
     x, y = upper.extent @ COS * 2 / DIRECTIONS, upper.extent @ SIN * 2 / DIRECTIONS
     return bool(np.all(COS * x + SIN * y < lower.extent))
 
@@ -136,7 +136,9 @@ def _extend_to_walls(grid: DepthGrid, plane: SupportingPlane) -> SupportingPlane
 def _count_above(grid: DepthGrid, plane: SupportingPlane) -> tuple[int, int]:
     """Count the samples of objects inside the outline of a plane, and all samples inside it.
 
-    Only samples of every second row and column are counted.
+    Samples of objects are more than twice the minimum height, and less than
+    `PlaneSettings.max_object_m`, above the plane. Only samples of every second row and column are
+    counted.
     """
     inv_depth, up, k = grid.inverse_depth, plane.up, grid.intrinsics
     across, along, _ = level_axes(up[0], up[1], up[2])
@@ -212,7 +214,7 @@ def _is_enclosed(grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane)
 def _count_below_edge(
     grid: DepthGrid, inliers: DepthSamples, plane: SupportingPlane, drop: float
 ) -> tuple[int, int]:
-    """Count the points straight below the front edge of a plane: on a wall, and in free space.
+    """Count the points below the front edge of a plane that are on a wall, and those in free space.
 
     The points begin just below the edge in front of each of the ``inliers``, which are the samples
     of the plane, and go down by at most ``drop``, its height above the next plane below, metres.
