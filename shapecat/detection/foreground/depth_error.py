@@ -75,11 +75,11 @@ def measure_residual(inv_depth: F4, heights: HeightMap, plane: F8, number: int, 
 def _find_low(
     inv_depth: F4, heights: HeightMap, plane: F8, number: int, i: int, raw: F4, mark: F4
 ) -> bool:
-    """Write the low cells of row ``i``: their inverse depth relative to the plane, and a mark of 1.
+    """Find the low cells of row ``i``; return whether there are any.
 
-    ``raw`` and ``mark`` (3, columns) hold both for the last three rows, row ``i`` at ``i % 3``, and
-    0 in the other cells. Returns whether the row has low cells. The other parameters are as in
-    `measure_residual`.
+    Their inverse depth relative to the plane is written to ``raw``, and 1 to ``mark``; both are 0
+    in the other cells. These arrays (3, columns) hold the last three rows, row ``i`` at the index
+    ``i % 3``. The other parameters are as in `measure_residual`.
     """
     plane_id, height = heights
     zero, one, low = np.float32(0), np.float32(1), np.float32(LOW.low_m)
@@ -102,8 +102,8 @@ def clear_contact(
 ) -> None:
     """Set the residual to 0 where the low cells at the foot of a higher object are steep.
 
-    From the cells of a higher object, the search follows low cells downwards as long as they fall
-    steeply.
+    So the foot is not taken for a low-profile object. From the cells of the higher object, the
+    search follows low cells downwards as long as they fall steeply.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
 
 @kernel
 def measure_noise(high_pass: F4, plane_id: I4, number: int) -> float:
-    """Return the median rise on a plane, 1/m; 0 if there is none.
+    """Return the median rise on a plane, 1/m; 0 if no rise can be measured.
 
     A rise is the absolute change of ``high_pass`` over `LOW.rise_cells` cells to the right or down.
     ``high_pass`` (rows, columns), 1/m, is from `filter_high_pass`; ``number``, from 1, is the

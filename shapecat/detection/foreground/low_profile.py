@@ -139,7 +139,7 @@ def _mark_objects(
 ) -> tuple[int, int]:
     """Mark the parts above each level that have the outline of an object.
 
-    The objects are numbered from ``objects`` + 1, the tested parts from ``parts`` + 1; the last
+    The objects are numbered from ``objects`` + 1, the parts from ``parts`` + 1; the last
     numbers are returned. ``object_ids`` (rows, columns) holds the number of the object at each
     cell, 0 elsewhere; ``high_pass`` (rows, columns) is from `filter_high_pass`. The cells of
     objects become cells above the plane in ``plane_id``. The other parameters are as in

@@ -18,7 +18,7 @@ class Limits(NamedTuple):
     Attributes
     ----------
     rise : minimum mean rise across the outline of an object, 1/m.
-    unit : what `LowProfileSettings.levels` are multiples of, 1/m.
+    unit : the unit of `LowProfileSettings.levels`, 1/m.
     width : largest width of an object, in cells at a depth of 1 m.
     discontinuity : step that separates two surfaces, 1/m.
     """
@@ -57,7 +57,8 @@ def width_of_part(inv_depth: F4, cells: I4, count: int) -> float:
     """Return the width of a part along the rows, in cells at a depth of 1 m.
 
     That is its width in cells times the depth of its first cell, metres. ``inv_depth`` is (rows,
-    columns), 1/m; the first ``count`` elements of ``cells`` are the flat indices of its cells.
+    columns), 1/m; the first ``count`` elements of ``cells`` are the flat indices of the part's
+    cells.
     """
     columns = inv_depth.shape[1]
     first, last = columns, 0

@@ -58,7 +58,7 @@ def extend_overhang(
     ----------
     heights : changed in place.
     planes : (planes,) records of `PLANE`, from `pack_planes`.
-    walls : (rows, columns) from `remove_walls`; cleared cells are not assigned.
+    walls : (rows, columns) from `remove_walls`; `CLEARED` cells are not assigned.
     max_height_m : maximum height of an object above its plane, metres.
     """
     shape = grid.inverse_depth.shape

@@ -16,8 +16,8 @@ from shapecat.jit import kernel, unset
 __all__ = ["CLEARED", "ON_WALL", "remove_walls"]
 
 ON_WALL, CLEARED = 1, 2
-"""Marks of cells on a wall: in a small or free-standing part, which may be an object in the plane
-of the wall; and in any other part, which is removed from the objects."""
+"""Marks of cells on a wall: `ON_WALL` in a small or free-standing part, which may be an object in
+the plane of the wall; `CLEARED` in any other part, which is removed from the objects."""
 UNMEASURED = 3
 """Mark of cells on a wall, in a connected part that is not measured yet."""
 
