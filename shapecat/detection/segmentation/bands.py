@@ -18,7 +18,10 @@ BANDS = 128
 
 @kernel
 def lateral_axis(up: F8) -> F8:
-    """Return the horizontal unit vector (3,) across the view, given ``up`` (3,); sensor frame."""
+    """Return the horizontal unit vector (3,) across the view, given ``up`` (3,); sensor frame.
+
+    It is perpendicular to the optical axis, unless this axis is nearly vertical.
+    """
     across = math.hypot(up[0], up[1])
     if across < 0.2:  # the camera looks straight down
         return np.array(level_axes(up[0], up[1], up[2])[0])

@@ -21,7 +21,8 @@ __all__ = ["SurfaceGraph", "connect_surfaces"]
 BENT = 4
 """A link's bit times this is a temporary bit: it marks links that only a local plane supports."""
 MIN_CHORD = 3e-4
-"""Squared distance between two unit normals at an angle of one degree."""
+"""Squared distance between two unit normals at an angle of one degree. Smaller concave angles count
+as 0."""
 
 BASE, BASE_DIAGONAL = SEGMENTATION.base, SEGMENTATION.base_diagonal
 SLOPE_CELLS = SEGMENTATION.slope_cells
@@ -34,7 +35,7 @@ class SurfaceGraph(NamedTuple):
     ----------
     local_plane : (rows, 3, columns) float32, inverse depth of the fitted plane at the cell, and its
         change per column and per row; 0 in object cells without a fit. Outside object cells, the
-        inverse depth is 0 near them, and everything else is uninitialised.
+        inverse depth is 0 near them; the rest is uninitialised.
     normal : (rows, 3, columns) float32 unit normal towards the camera, sensor frame; 0 in object
         cells without a fit, uninitialised elsewhere.
     links : (rows, columns) uint8, `RIGHT` and `DOWN` where the surface continues to that neighbour.
@@ -161,7 +162,7 @@ def _link_run(
     ----------
     plane_id, inv_depth, planes, links : the arrays of `_link`, flattened.
     jump : step in inverse depth that separates two surfaces, 1/m.
-    run : the index of its first cell, the index of that cell's local plane, and the number of
+    run : the index of the first cell, the index of that cell's local plane, and the number of
         cells.
     steps : index offsets from a cell to its neighbour, from its local plane to the neighbour's, and
         from the inverse depth of a local plane to its slope in that direction.
@@ -227,7 +228,7 @@ def _raise_concavity(
     ----------
     flat : inverse depth, local planes and normals of all cells, flattened.
     gate : largest distance of either local plane from the sample of the cell, 1/m.
-    cells : the row, the first column, one past the last, and the number of columns.
+    cells : the row, the first column, one past the last, and the number of columns of the grid.
     shift : offset, in rows and columns, from a cell to one of the two normals that are compared;
         the other is at the opposite offset.
     gaps, chords : (columns,) work space.
@@ -236,8 +237,8 @@ def _raise_concavity(
     Notes
     -----
     There are three loops, because the compiler vectorises only loops over few arrays. There are no
-    slices, because each counts references. Indices are unsigned, because signed ones are checked
-    for negative values.
+    slices, because numba counts the references to each. Indices are unsigned, because signed ones
+    are checked for negative values.
     """
     i, first, last, columns = cells
     di, dj = shift

@@ -83,7 +83,8 @@ def _write(fits: F4, planes: F4, normals: F4, start: int, columns: int, n: int) 
 def _next_run(plane_ids: I4, row: int, j: int, last: int) -> tuple[int, int]:
     """Return the first column, and one past the last, of the next run of cells above one plane.
 
-    The search begins at column ``j``. ``plane_ids`` are as in `HeightMap`, flattened. There must be
+    Gaps narrower than `SegmentationSettings.bridged` are included. The search begins at column
+    ``j``. ``plane_ids`` are as in `HeightMap`, flattened. There must be
     an object cell before ``last``; ``row`` is the index of the first cell of the row.
     """
     while plane_ids[row + j] <= 0:
@@ -193,9 +194,10 @@ def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> An
 def _four(
     values: F4, p: int, center: float, outer_gate: float, inner_gate: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the sums of 1, x, x x, v, x v over the samples at columns -3, -1, 1, 3 from ``p``.
+    """Return the sums of 1, x, x², v, x v over the samples at columns -3, -1, 1, 3 from ``p``.
 
-    Here x is the column, v the difference from ``center``. ``values`` are from `_copy_windows`; the
+    Here x is the column relative to ``p``, and v the difference from ``center``, 1/m; samples of
+    weight 0 do not count. ``values`` are from `_copy_windows`; the
     gates of the outer and the inner samples are as in `_sample`.
     """
     a, va = _sample(values, p - 3, center, outer_gate)
@@ -211,9 +213,9 @@ def _four(
 def _three(
     values: F4, p: int, center: float, outer_gate: float, inner_gate: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the sums of 1, x, x x, v, x v over the samples at columns -2, 0, 2 from ``p``.
+    """Return the sums of 1, x, x², v, x v over the samples at columns -2, 0, 2 from ``p``.
 
-    The parameters are as in `_four`; the inner gate is for column 0.
+    Sums and parameters are as in `_four`; the inner gate is for column 0.
     """
     a, va = _sample(values, p - 2, center, outer_gate)
     b, vb = _sample(values, p, center, inner_gate)

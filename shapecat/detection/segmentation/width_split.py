@@ -111,7 +111,11 @@ def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, sid
 
 @kernel(inline=True)
 def _find_cuts(outlines: Outlines, p: int, cuts: Bool) -> bool:
-    """Mark in ``cuts`` (BANDS,) the bands below which label ``p`` is cut; return whether any is."""
+    """Mark in ``cuts`` (BANDS,) the bands below which label ``p`` is cut; return whether it is cut.
+
+    A cut needs the largest step nearby, at least `SegmentationSettings.both_steps_m`, and enough
+    cells on either side.
+    """
     first, last, band_count, above = 0, 0, 0, 0
     for band in range(BANDS):
         cells = outlines.counts[p, band]
