@@ -18,7 +18,7 @@ _COS, _SIN = COS.astype(np.float32), SIN.astype(np.float32)
 
 @kernel(inline=True)
 def extend_hull(hull: F4, row: int, first: int, last: int) -> None:
-    """Extend a hull (`DIRECTIONS`,), in place, to the cells of a row from ``first`` to ``last``."""
+    """Extend a hull (`DIRECTIONS`,), in place, to cells of a row, from ``first`` up to ``last``."""
     for d in range(DIRECTIONS):
         column = np.float32(first if _COS[d] < 0 else last)
         hull[d] = max(hull[d], column * _COS[d] + row * _SIN[d])

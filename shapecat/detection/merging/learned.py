@@ -28,6 +28,7 @@ from shapecat.trees import BoostedTrees, logit_of, read_trees
 __all__ = ["FILE", "load_trees", "merge_learned"]
 
 FILE = "parts.npz"
+"""Name of the file of the trees, in this package."""
 
 
 @cache
@@ -71,7 +72,7 @@ def _rate(
     pair: Records,
     logits: F8,
 ) -> None:
-    """Write the log-odds that segment ``p`` belongs to the same object as each of ``first`` to n.
+    """Write the log-odds that ``p`` belongs to the same object as each segment from ``first`` to n.
 
     In ``logits`` (n + 1, n + 1), for n segments, the row is the smaller of the two segment numbers;
     the logit is -inf if the two are not adjacent. ``features`` are as in `write_pair_features`;

@@ -169,7 +169,7 @@ def _distance(a: Row, b: Row) -> float:
 def pair_features(
     segments: Segments, p: int, q: int, view_geometry: ViewGeometry, out: Row
 ) -> None:
-    """Write the `PAIR_FEATURES` of segments ``p`` and ``q`` to the record ``out``."""
+    """Write the `PAIR_FEATURES` of segments ``p`` and ``q`` to ``out``, from their statistics."""
     features = np.zeros(segments.parent.size, SEGMENT_FEATURES)
     write_segment_features(segments, p, features[p])
     write_segment_features(segments, q, features[q])
@@ -180,9 +180,9 @@ def pair_features(
 def write_pair_features(
     segments: Segments, features: Records, p: int, q: int, view_geometry: ViewGeometry, out: Row
 ) -> None:
-    """Write the `PAIR_FEATURES` of segments ``p`` and ``q`` to the record ``out``.
+    """Do the work of `pair_features`, given the ``features`` of the segments.
 
-    ``features`` (n + 1,) are the `SEGMENT_FEATURES` of all segments.
+    These (n + 1,) are `SEGMENT_FEATURES`; only those of ``p`` and ``q`` are read.
     """
     area_p, area_q = segments.statistics[p].area, segments.statistics[q].area
     if area_p > area_q or (area_p == area_q and p > q):

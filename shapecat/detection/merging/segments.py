@@ -119,7 +119,7 @@ def measure_segments(
 
 
 def _blank(size: int) -> Segments:
-    """Return statistics of segments that have no cells yet."""
+    """Return statistics of ``size`` - 1 segments that have no cells yet."""
     segments = Segments(
         np.zeros((size, size), PAIR),
         np.zeros(size, SEGMENT),
