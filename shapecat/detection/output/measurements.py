@@ -102,7 +102,7 @@ def measure_objects(
 
 
 def _extend_to_planes(boxes: Boxes, standing: Bool, up: F8, plane_offsets: F8) -> None:
-    """Extend boxes down to their planes, in place, by at most `OUTPUT.lifted_m`.
+    """Extend boxes down to their planes, in place, over gaps of at most `OUTPUT.lifted_m`.
 
     The lowest millimetres of an object are labelled as plane. ``standing`` (n,) is whether each
     object touches its plane and stands on no other object; ``up`` (3,) and ``plane_offsets`` (n,),
@@ -251,11 +251,11 @@ def _measure_boxes(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> None
 
 @kernel(fast=True, inline=True)
 def _outer_points(grid: DepthGrid, labels: I4, level: F8, boxes: Boxes) -> tuple[F4, I4]:
-    """Return points (3, n) of the objects, level frame, and the index where each object begins.
+    """Return points (3, p) of the objects, level frame, and the index where each object begins.
 
     The points are the outermost cells, and the cells inside at every 4th row and column, since the
-    nearest point of a ball is inside its outline. Also writes ``boxes.low`` and ``boxes.high``. The
-    parameters are as in `_measure_boxes`.
+    nearest point of a ball is inside its outline. The indices (n + 1,) end with p. Also writes
+    ``boxes.low`` and ``boxes.high``. The parameters are as in `_measure_boxes`.
     """
     rows, columns = labels.shape
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics

@@ -49,10 +49,10 @@ def label_points(
 def _above(
     points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: Row, max_height_m: float
 ) -> Bool:
-    """Return which points (n, 3) are above a plane and inside its outline, (n,).
+    """Return which points (n, 3), view frame, are above a plane and inside its outline, (n,).
 
-    ``cell`` (n,) is as in `VirtualImage`; ``max_height_m`` is the maximum height above the plane,
-    metres.
+    The result is False for points out of view. ``cell`` (n,) is as in `VirtualImage`;
+    ``max_height_m`` is the maximum height above the plane, metres.
     """
     result = np.zeros(len(points), np.bool_)
     for k in range(len(points)):

@@ -37,8 +37,8 @@ def build_scene(
 ) -> Scene:
     """Build the scene, in the sensor frame, from labelled cells and the points of each label.
 
-    Objects with too few points are left out, and so are those above an assumed plane that the
-    border or the range limit cuts off, and those that the view does not show if they are too large.
+    Left out are objects with too few points, objects above an assumed plane that the border or the
+    range limit cuts off, and objects that the view does not show and that are too large.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def _select_objects(
     *,
     image: bool,
 ) -> list[int]:
-    """Return which lists in ``indices`` have enough points, in the order of their first points.
+    """Return the indices of the lists with enough points, in the order of their first points.
 
     ``indices`` are the pixels or points of each label; ``image`` says whether they are pixels. A
     list needs ``min_points`` and, in an image, as many pixels as `ObjectMeasurements.min_cells`
@@ -114,7 +114,7 @@ def _select_objects(
 
 
 def _has_object_size(box: Box, settings: DetectionSettings) -> bool:
-    """Return whether a hidden object is small enough, unlike a wall or furniture.
+    """Return whether an object that the view does not show is small enough not to be structure.
 
     `find_background` checks the visible objects.
     """
@@ -126,7 +126,7 @@ def _has_object_size(box: Box, settings: DetectionSettings) -> bool:
 def _boxes(
     segmentation: Segmentation, indices: Sequence[U4], points: F4 | None, sensor_from_view: Pose
 ) -> list[Box]:
-    """Return the boxes of all lists: measured on cells, or on points for hidden objects.
+    """Return the box of each list in ``indices``, measured on cells, or on points if not in view.
 
     ``indices`` and ``points`` are as in `build_scene`. The boxes are in the sensor frame.
     """
@@ -156,7 +156,7 @@ def _at_image_border(grid: DepthGrid, segmentation: Segmentation, _: Pose) -> Bo
 
 
 def _at_view_border(grid: DepthGrid, segmentation: Segmentation, sensor_from_view: Pose) -> Bool:
-    """Return whether each object reaches the border of the sensor's view, for a point cloud.
+    """Return for each object (n,) whether it reaches the border of the sensor's view.
 
     Such a border is a long straight side of the cloud as seen from the sensor. If the virtual
     camera is elsewhere (`top_view`), none is searched for.
@@ -202,7 +202,7 @@ def _transform_box(sensor_from_view: Pose, box: Box) -> Box:
 
 
 def _plane(plane: Row, lowest: float, sensor_from_view: Pose) -> Plane:
-    """Return a `PLANE` as a record in the sensor frame, at its height above ``lowest``.
+    """Return a `PLANE` as a `Plane` in the sensor frame, with its height above ``lowest``.
 
     ``lowest`` is the offset of the lowest visible plane, metres.
     """

@@ -22,8 +22,8 @@ class OutputConstants(NamedTuple):
     """Largest distance, metres, from the visible part of an object backwards to the middle of
     another one that stands on it: its back is hidden."""
     lifted_m: float = 0.03
-    """An object whose bottom is higher than this above its plane, metres, and does not touch it,
-    stands on something else, which may be hidden."""
+    """An object whose bottom is more than this above its plane, metres, without touching it, stands
+    on something else, which may be hidden."""
     sunk_m: float = 0.015
     """An object that extends this far below a surface, metres, does not stand on it."""
     voxel_m: float = 0.01
