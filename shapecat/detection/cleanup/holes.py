@@ -1,4 +1,4 @@
-"""Hole filling: object cells at the level of their plane, such as the floors of bowls."""
+"""Hole filling: cells of objects at the level of their plane, such as the floors of bowls."""
 
 import numpy as np
 

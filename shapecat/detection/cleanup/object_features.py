@@ -91,7 +91,8 @@ class ViewLimits(NamedTuple):
 
     Attributes
     ----------
-    top, bottom, left, right : first and last row and column inside the blank borders of the image.
+    top, bottom, left, right : first and last row, and first and last column, inside the blank
+        borders of the image.
     inverse_depth : a cell with a smaller inverse depth is at the range limit, 1/m.
     """
 

@@ -104,9 +104,9 @@ def is_uncertain(logits: F4) -> Bool:
 
 @kernel
 def logits_of(features: F4, ensemble: BoostedTrees) -> F4:
-    """Return the logits (n,) that segments with these features (n, f) are objects.
+    """Return the log-odds (n,) that segments with these ``features`` (n, f) are objects.
 
-    They are within `CleanupSettings.certain_logit` of 0.
+    They are limited to ± `CleanupSettings.certain_logit`.
     """
     certain = CLEANUP.certain_logit
     logits = np.zeros(len(features), np.float32)
