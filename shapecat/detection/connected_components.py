@@ -91,7 +91,7 @@ def _root(parent: I4, k: int) -> int:
 
 @kernel
 def spans_of(labels: I4) -> I4:
-    """Return the spans (rows, 2) of ``labels`` (rows, columns): the `span_of` each row."""
+    """Return the spans (rows, 2) of ``labels`` (rows, columns): the result of `span_of` per row."""
     spans = np.zeros((labels.shape[0], 2), np.int32)
     for i in range(len(spans)):
         spans[i, 0], spans[i, 1] = span_of(labels[i])

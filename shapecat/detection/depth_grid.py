@@ -82,8 +82,9 @@ class DepthGrid(NamedTuple):
 def downsample(depth: F4, camera: Camera, *, range_m: float) -> DepthGrid | None:
     """Downsample a depth image: a cell averages the depths close to its nearest depth.
 
-    Return None if no depth is within ``range_m``. If both sides of the image are longer than 50
-    pixels, this search reads only every fifth row and column.
+    Cells are about `CELL_M` wide at the median depth, and at least one pixel. Return None if no
+    depth is in range. In an image larger than 50 x 50 pixels, only every fifth row and column is
+    read for this and for the median.
 
     Parameters
     ----------
@@ -179,7 +180,7 @@ def find_borders(inv_depth: F4, band: int) -> I4:
     Parameters
     ----------
     inv_depth : (rows, columns) 1/m.
-    band : number of lines, from the first that has a sample, whose samples count for the extent.
+    band : number of lines, from the first that has a sample, in which the extent is measured.
 
     Returns
     -------

@@ -19,8 +19,11 @@ WIDEST_SLOPE = 1.5
 OUTSIDE = 9.0
 """Placeholder for the slope x / z of a point that is not in view."""
 MAX_CELLS = 400_000
-MAX_ROWS = 2000  # and columns
-MIN_POINTS = 100  # in view
+"""Approximate upper bound of the number of cells, which bounds the time per frame."""
+MAX_ROWS = 2000
+"""Approximate upper bound of the number of rows, and of columns."""
+MIN_POINTS = 100
+"""Minimum number of points in view; there is no image of fewer."""
 POINTS_PER_CELL = 1.8
 """Minimum number of points per occupied cell, on average; with fewer, surfaces have holes."""
 
@@ -83,8 +86,8 @@ def top_view(
     ----------
     points : (n, 3) metres, sensor frame; rows that are not finite are ignored.
     hint : (3,) the up direction, sensor frame, or None if unknown. If given, only planes with a
-        normal within 15 degrees of it are considered, and their upper side is the one facing up.
-    range_m : points farther from the origin are ignored, metres.
+        normal within 15 degrees of it are considered, and it determines their upper side.
+    range_m : points farther from the sensor are ignored, metres.
     rng : source of the random points.
 
     Returns
@@ -133,10 +136,10 @@ def _dominant_plane(sample: F8, hint: F8 | None, rng: np.random.Generator) -> F8
 
 @kernel
 def _sum_of_directions(points: F4, origin: F8, range_m: float) -> tuple[F8, int]:
-    """Return the sum (3,) of unit vectors to the points within twice the range, and their number.
+    """Return the sum (3,) of the unit vectors from ``origin`` to points, and their number.
 
-    The vectors start at ``origin`` (3,). ``origin``, ``points`` (n, 3) and ``range_m``, the range,
-    are in metres.
+    Points nearer than `NEAREST_M`, or farther away than twice ``range_m``, are left out. ``origin``
+    (3,), ``points`` (n, 3) and ``range_m`` are in metres.
     """
     ax = ay = az = 0.0
     n = 0
@@ -161,7 +164,7 @@ def _to_view(
     Writes the points to ``in_view`` (n, 3), their slopes x / z and y / z to ``slopes`` (n, 2), and
     the smallest and largest slopes to ``bounds`` (4,): left, top, right, bottom. Points out of
     view, or deeper than ``range_m``, metres, get `OUTSIDE` as x / z. ``rotation`` (3, 3) and
-    ``translation`` (3,) map ``points`` (n, 3) to that frame.
+    ``translation`` (3,) map ``points`` (n, 3) to the frame of the virtual camera.
     """
     r, s = rotation, translation
     n = 0
@@ -191,7 +194,7 @@ def _to_view(
 def _rotation_to(axis: F8) -> F8:
     """Return a rotation (3, 3) that turns ``axis`` to +z.
 
-    The new +x is close to the old one or, if ``axis`` is close to the x axis, to the old -y.
+    The new +x is close to the old +x or, if ``axis`` is close to the x axis, to the old -y.
     """
     z = axis / np.linalg.norm(axis)
     x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.8 else np.array([0.0, -1.0, 0.0])
@@ -269,9 +272,9 @@ def _project(
 ) -> int:
     """Average the inverse depth of each cell's nearest points; count the points well behind them.
 
-    Writes to ``inv_depth`` (rows, columns), and the flat index of the cell of each point to
-    ``cell`` (n,); returns the count. ``points`` (n, 3) and ``slopes`` (n, 2) are from `_to_view`.
-    ``jump`` is the step in inverse depth that separates two surfaces, 1/m.
+    Writes to ``inv_depth`` (rows, columns), zeros on entry, and the flat index of the cell of each
+    point to ``cell`` (n,), -1 on entry; returns the count. ``points`` (n, 3) and ``slopes`` (n, 2)
+    are from `_to_view`. ``jump`` is the step in inverse depth that separates two surfaces, 1/m.
     """
     rows, columns = inv_depth.shape
     nearest = np.zeros(inv_depth.shape, np.float32)
