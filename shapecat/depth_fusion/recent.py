@@ -9,13 +9,13 @@ from shapecat.types import Frame, Pose
 __all__ = ["Earlier", "RecentFrames"]
 
 GAP_NS = 500_000_000
-"""Longest time between consecutive frames that are fused."""
+"""Longest time between consecutive frames that are fused, nanoseconds."""
 
 
 class Earlier(NamedTuple):
-    """An earlier frame, and the current pose of the sensor relative to its pose then.
+    """An earlier frame, and the pose of the current sensor frame in the sensor frame of that time.
 
-    The pose is None if it is not known; the sensor is then assumed not to have moved.
+    The pose is None if it is unknown; the sensor is then assumed not to have moved.
     """
 
     frame: Frame
@@ -54,7 +54,7 @@ class RecentFrames:
         return earlier
 
     def warnings(self) -> list[str]:
-        """Return warnings for the user about the frames so far."""
+        """Return warnings for the user, per topic: clouds that are not fused, and unknown poses."""
         return [
             f"{topic}: clouds are not fused, only depth images (frames: {n})"
             for topic, n in self._clouds.items()
