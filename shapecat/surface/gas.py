@@ -89,7 +89,8 @@ def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float)
     """Grow a gas on points (m, 3), metres, by Algorithm 3 of the thesis.
 
     ``neurons``, ``signals`` and ``share`` (``component_share``) are as in `SurfaceSettings`;
-    ``seed`` starts the random generator. Returns the neurons (k, 3), metres, and the edges (e, 2).
+    ``seed`` starts the random generator. Returns the neurons (k, 3), metres, and the edges (e, 2),
+    pairs of their indices; both are empty if fewer than 3 neurons remain.
     """
     cloud, shift_scale = _normalise(points)
     target = _target_size(cloud, neurons)
@@ -171,7 +172,7 @@ def _in_metres(gas: Gas, count: int, shift_scale: F8) -> F4:
 
 @kernel(inner=True)
 def _target_size(cloud: Cloud, neurons: int) -> int:
-    """Return the number of neurons to grow: at most ``neurons``, fewer in a small cloud."""
+    """Return the number of neurons to grow: ``neurons``, or fewer in a small cloud; at least 3."""
     max_neurons = max(_FEWEST_NEURONS, int(_NEURONS_PER_POINT * cloud.x.size))
     return max(3, min(neurons, max_neurons))
 

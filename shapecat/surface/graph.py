@@ -94,7 +94,7 @@ def finish_graph(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
 
 @kernel(inner=True)
 def edge_list(adjacent: Bool) -> U2:
-    """Return the (m, 2) pairs i < j that are adjacent, in lexicographic order."""
+    """Return the pairs i < j of adjacent neurons, (m, 2), in lexicographic order."""
     count = adjacent.shape[0]
     edges = np.zeros((count * count // 2 + 1, 2), np.uint16)
     n = 0
@@ -168,7 +168,8 @@ def _squared_distance(gas: Gas, i: int, j: int) -> float:
 def _compact(gas: Gas, adjacent: Bool, members: I4, stays: Bool, count: int) -> int:
     """Drop some of ``count`` neurons and close the gaps, in order; return how many remain.
 
-    ``stays`` (count,) marks those that remain. ``adjacent`` (count, count) and ``members``, the
+    ``stays`` (count,) is True for those that remain. Of ``gas``, only the positions are moved.
+    ``adjacent`` (count, count) and ``members``, the
     number of points of each neuron (count,), are changed too.
     """
     n = 0

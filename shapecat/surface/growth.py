@@ -24,8 +24,8 @@ __all__ = ["Cloud", "Rates", "grow_fritzke", "grow_thesis"]
 
 
 _GAIN = 1 / 0.9995
-"""Factor by which each signal's error weighs more than that of the one before, instead of a decay
-of all earlier errors to 0.9995 of their size."""
+"""Ratio of the weights of the errors of one signal and of the signal before. It takes the place of
+a decay of all earlier errors to 0.9995 of their size."""
 
 
 class Cloud(NamedTuple):
@@ -89,9 +89,9 @@ def _adapt_to_signal(
 
     The signal is (``sx``, ``sy``, ``sz``); ``gain`` is the weight of its error, ``mask`` is from
     `index_mask`, and the rates are as in `Rates`, at this signal. The arrays of a `Gas` with
-    ``count`` neurons are passed one by one: unpacking it takes as long as a step. Step 10 is the
-    caller's: with a conditional call in here, numba counts references to the arrays for each
-    signal, which takes longer than all steps together.
+    ``count`` neurons are passed one by one: unpacking the tuple takes as long as one of the steps.
+    Step 10 is the caller's: with a conditional call in here, numba counts references to the arrays
+    for each signal, which takes longer than all steps together.
     """
     padded = (count + LANES - 1) // LANES * LANES
     # 5. find the nearest and the second nearest neuron
@@ -266,8 +266,8 @@ def grow_thesis(
 def _prune(gas: Gas, count: int, before: I4) -> int:
     """Remove neurons whose ``wins`` are still as in ``before``; return how many remain.
 
-    At least 3 remain. The last neurons, with their elements of ``before`` (count,), take the places
-    of removed ones.
+    At least 3 remain. One neighbour of a removed neuron takes over its edges. The last neurons,
+    with their elements of ``before`` (count,), take the places of removed neurons.
     """
     i = 0
     while i < count:

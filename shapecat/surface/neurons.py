@@ -23,7 +23,9 @@ __all__ = [
 ]
 
 ABSENT = np.int32(1 << 29)
+"""Element of `Gas.edge_birth` without an edge: larger than any sum of wins."""
 FAR = np.float32(1e18)
+"""Coordinate of an element of `Gas` without a neuron: farther away than any neuron."""
 
 
 class Gas(NamedTuple):
@@ -33,11 +35,12 @@ class Gas(NamedTuple):
     ----------
     x, y, z : (n,) positions; `FAR` where there is no neuron.
     error : (n,) accumulated squared distances.
-    degree : (n,) numbers of edges.
+    degree : (n,) number of edges of each neuron.
     wins : (n,) number of signals for which each neuron was the nearest.
     edge_birth : (n * n,) for the edge i-j, element ``i * n + j`` is the sum ``wins[i] + wins[j]``
-        when it was last refreshed; `ABSENT` without an edge. The age of an edge is the growth of
-        that sum, so one increment ages all edges of the winner, and its neighbours are in one row.
+        when the edge was last refreshed; `ABSENT` without an edge. The age of an edge is the growth
+        of that sum, so one increment ages all edges of the winner, and its neighbours are in one
+        row.
     """
 
     x: F4
