@@ -1,8 +1,8 @@
 """The one place where kernels are compiled.
 
 ``@kernel`` is numba's ``njit`` with fixed options: machine code is cached on disk until a source
-file of its stage changes, the interpreter lock is released, and division by zero follows IEEE 754,
-as in numpy.
+file of its stage (its subpackage, such as `detection`) changes, the interpreter lock is released,
+and division by zero follows IEEE 754, as in numpy.
 """
 
 import hashlib
@@ -28,6 +28,7 @@ _FAST = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 """Fast-math flags without ``ninf``: sums and minima vectorise, and infinities stay valid."""
 _HERE = Path(__file__).parent
 _LARGE_BYTES = 2**24
+"""Size of a block that raises the thresholds of glibc enough, see `_keep_freed_memory`."""
 _SHARED = (_HERE / "geometry.py", _HERE / "jit.py", *(_HERE / "trees").glob("*.py"))
 """Files whose kernels every stage may call."""
 
@@ -152,7 +153,7 @@ def _places(stage: Path) -> Iterator[Path]:
 def _temporary_folder() -> Path | None:
     """Make a temporary folder that only this user can write to; return None if that is impossible.
 
-    Machine code is loaded from it.
+    Others must not write to it, because machine code is loaded from it.
     """
     with suppress(OSError):
         folder = Path(tempfile.gettempdir(), f"shapecat-{os.getuid()}")
