@@ -144,9 +144,9 @@ def _expected_depth(depth: F4, range_m: float) -> F4:
 def _agreeing_share(expected: F4, earlier: F4, homography: F4, shift: F4) -> float:
     """Return the fraction of the compared pixels, with depth in both images, whose depths agree.
 
-    The result is 0 if no such pixel has depth in both. ``expected`` (h, w) is from
-    `_expected_depth`, ``homography`` and ``shift`` from `_homography`; ``earlier`` (h, w) are the
-    depths of the earlier image, metres.
+    The result is 0 if there is no such pixel. ``expected`` (h, w) is from `_expected_depth`,
+    ``homography`` and ``shift`` from `_homography`; ``earlier`` (h, w) are the depths of the
+    earlier image, metres.
     """
     columns = expected.shape[1]
     places = np.zeros((3, columns), np.float32)

@@ -16,6 +16,7 @@ from shapecat.detection.merging.segments import Segments
 __all__ = ["CONTEXT_FEATURES", "add_context", "measure_borders"]
 
 _NEIGHBOURS = ("connected", "behind", "in_front", "near")
+"""The kinds of neighbours, in the order of the borders from `measure_borders`."""
 CONTEXT_FEATURES = np.dtype(
     [
         ("object", OBJECT_FEATURES),

@@ -198,7 +198,7 @@ def _find_seeds(high_pass: F4, threshold: float, seeds: I4) -> int:
     n = 0
     for i in range(1, rows):
         for start in range(1, columns, CELLS_PER_BLOCK):
-            # Unsigned indices instead of slices, each of which counts references.
+            # Unsigned indices instead of slices: numba counts the references to each slice.
             cell = np.uint64(i * columns + start)
             before, above = cell - np.uint64(1), np.uint64((i - 1) * columns + start)
             cells = np.uint64(min(CELLS_PER_BLOCK, columns - start))

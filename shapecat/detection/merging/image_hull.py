@@ -28,8 +28,9 @@ def extend_hull(hull: F4, row: int, first: int, last: int) -> None:
 def hull_area(a: F4, b: F4) -> float:
     """Return the area of the convex hull around hulls ``a`` and ``b`` (`DIRECTIONS`,), in cells.
 
-    It is half the sum, over the sides of the polygon, of length times distance from the origin. The
-    length of a side follows from its neighbours.
+    The area includes half a cell around the centres of the outermost cells. It is half the sum,
+    over the sides of the polygon, of length times distance from the origin. The length of a side
+    follows from its neighbours.
     """
     turn, half = 2 * math.pi / DIRECTIONS, np.float32(0.5)  # cells are squares, not points
     twice, total = 2 * math.cos(turn), 0.0

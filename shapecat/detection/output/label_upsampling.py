@@ -27,7 +27,7 @@ UNSURE, BARE = -1, -2
 """Codes in place of a label. `UNSURE`: a closer test is needed. `BARE`: an unlabelled cell is next
 to a labelled one."""
 PIXELS_PER_BLOCK = 16
-"""Number of pixels that one vectorised test covers; most are like the previous ones."""
+"""Number of pixels that one vectorised test covers; most have the mark of the pixel before."""
 
 
 def label_pixels(

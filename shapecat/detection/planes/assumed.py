@@ -21,7 +21,8 @@ SAMPLE_STRIDE = 4
 def find_unexplained(grid: DepthGrid, explained: I4 | U1) -> Bool | None:
     """Return a mask (rows, columns) of the near samples where ``explained`` is 0; None if too few.
 
-    ``explained`` (rows, columns) is 0 except on a plane, above one, or on a wall.
+    Near means within `AssumedSettings.max_depth_m`. ``explained`` (rows, columns) is 0 except on or
+    above a plane, and on walls.
     """
     in_range = grid.inverse_depth > np.float32(1 / ASSUMED.max_depth_m)
     unexplained: Bool = (explained == 0) & in_range

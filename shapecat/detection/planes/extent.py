@@ -79,7 +79,7 @@ def measure_candidate(grid: DepthGrid, samples: DepthSamples, plane: F8) -> Plan
 
 @kernel
 def _measure(grid: DepthGrid, inliers: DepthSamples, plane: F8) -> SupportingPlane:
-    """Measure height, extent and area of a plane (a, b, c)."""
+    """Measure the height, extent and area of a plane (a, b, c) on its ``inliers``."""
     normal = plane_normal(plane, grid.intrinsics)
     x, y = plane[0] * grid.intrinsics.fx, plane[1] * grid.intrinsics.fy
     z = plane[0] * grid.intrinsics.cx + plane[1] * grid.intrinsics.cy + plane[2]

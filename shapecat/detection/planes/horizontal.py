@@ -69,8 +69,8 @@ def _measure_candidates(
 def _common_up(candidates: list[PlaneCandidate]) -> F8:
     """Return the mean normal of the planes, a unit vector (3,).
 
-    It is weighted by the precision of each normal: visible area times squared width, which is the
-    width of the outline in its narrowest direction.
+    Each normal is weighted by its precision: the visible area of the plane times the square of the
+    smallest width of its outline.
     """
     half = DIRECTIONS // 2
     mean = np.zeros(3)

@@ -65,8 +65,8 @@ def estimate_up(
 def _every_second(points: OrientedPoints, intrinsics: PinholeIntrinsics) -> F4:
     """Return the normal, position, weight and area (8, n), in this order, of every second point.
 
-    Half of the points are enough, and faster; those without a normal are left out. Positions are in
-    metres, areas in m2.
+    Half of the points are enough, and faster. Points without a normal are left out. Positions are
+    in metres, areas in m2.
     """
     normals, positions = points.normals, points.positions
     surface = np.zeros((8, normals.shape[1] // 2 + 1), np.float32)

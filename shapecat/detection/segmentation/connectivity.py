@@ -237,7 +237,7 @@ def _raise_concavity(
     Notes
     -----
     There are three loops, because the compiler vectorises only loops over few arrays. There are no
-    slices, because numba counts the references to each. Indices are unsigned, because signed ones
+    slices, because numba counts references to each. Indices are unsigned, because signed ones
     are checked for negative values.
     """
     i, first, last, columns = cells

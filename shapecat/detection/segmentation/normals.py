@@ -20,6 +20,7 @@ __all__ = ["fit_local_planes", "padded"]
 WINDOW = 3
 """Half the edge of the window to which a local plane is fitted, in cells."""
 SIDE = 2 * WINDOW + 1
+"""Edge of the window, in cells."""
 RUN = 128
 """Maximum number of cells in a run."""
 LANES = 8
@@ -144,7 +145,7 @@ def _fit_run(
     for k in range(n):
         p = k + WINDOW
         center = values[WINDOW * PITCH + p]
-        # (1) sums over the rows of the window: 1, x, x x, v, x v
+        # (1) sums over the rows of the window: 1, x, x², v, x v
         n0, x0, xx0, v0, xv0 = _four(values, p, center, g3, g3)
         n1, x1, xx1, v1, xv1 = _three(values, PITCH + p, center, g2, g2)
         n2, x2, xx2, v2, xv2 = _four(values, 2 * PITCH + p, center, g3, g1)
