@@ -193,8 +193,9 @@ def _find_planes(
 ) -> tuple[F8, Records, HeightMap] | None:
     """Return the up direction (3,), the supporting planes and the height map; None without a plane.
 
-    The planes are from `pack_planes`. ``hint`` and ``upright`` are as in `model_planes`, ``trials``
-    from `draw_trials`.
+    The planes are from `pack_planes`; an assumed plane is added if many samples are above no other
+    plane. If not ``upright``, the result is None without a visible plane. ``hint`` and ``upright``
+    are as in `model_planes`, ``trials`` from `draw_trials`.
     """
     max_height_m = settings.max_height_m
     supports, up = find_supporting_planes(

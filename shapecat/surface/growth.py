@@ -43,7 +43,7 @@ class Rates(NamedTuple):
     ----------
     winner, neighbour : epsilon_b and epsilon_n at the first signal: the fractions of the distance
         to the signal by which the winner and its neighbours move.
-    oldest : age above which an edge is removed (a_max).
+    oldest : age above which an edge is removed (a_max), see `Gas.edge_birth`.
     """
 
     winner: float

@@ -72,7 +72,7 @@ def empty_gas(room: int) -> Gas:
 
 @kernel(inner=True)
 def index_mask(count: int) -> int:
-    """Return the smallest 2**k - 1 that is at least ``count - 1``, the largest index."""
+    """Return the ``mask`` of `two_nearest`: the smallest 2**k - 1 of at least ``count - 1``."""
     mask = 1
     while mask < count:
         mask <<= 1

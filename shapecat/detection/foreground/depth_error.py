@@ -201,7 +201,7 @@ def _slide(residual: F4, i: int, sign: int, sums: I4, counts: I4) -> None:
 def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
     """Write the sum over the window around each column, and the number of low cells, at least 1.
 
-    ``sums`` and ``counts`` are from `_slide`; ``total`` and ``count`` (columns,) are written.
+    ``sums`` and ``counts`` are as in `_slide`; ``total`` and ``count`` (columns,) are written.
     """
     width = 2 * LOW.window + 1
     window = number = np.int32(0)

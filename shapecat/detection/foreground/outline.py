@@ -93,7 +93,7 @@ def measure_outline(
     number: int,
     limits: Limits,
 ) -> Outline:
-    """Measure the outline of a part.
+    """Measure the outline of a part, which is a connected set of low cells.
 
     Parameters
     ----------

@@ -104,7 +104,7 @@ def _find_border(plane_id: I4, number: int, i: int, border: U1) -> bool:
 
 @kernel(inline=True)
 def _continues(over: Overhang, i: int, j: int) -> bool:
-    """Return whether the surface at a cell above the plane continues outside its outline."""
+    """Return whether the surface at cell (i, j) continues outside the outline of the plane."""
     rows, columns = over.visited.shape
     continues, w = False, over.grid.inverse_depth[i, j]
     for di, dj in SIDES:

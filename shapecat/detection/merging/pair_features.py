@@ -246,7 +246,7 @@ def _above_top(segments: Segments, p: int, q: int) -> float:
 
 @kernel(inline=True)
 def _write_relation(a: Row, b: Row, out: Row) -> None:
-    """Write the fields of a `_RELATION` that compare two `SEGMENT` records to ``out``."""
+    """Write the fields of a `_RELATION` that compare two `SEGMENT` records, ``a`` the first."""
     width_a, width_b = width_of(a), width_of(b)
     max_width = max(width_a, width_b)
     left, right = b.left - a.left, a.right - b.right

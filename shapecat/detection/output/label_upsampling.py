@@ -131,7 +131,7 @@ def _find_unsure(line: I4, start: int, end: int, cells: I4) -> int:
 
 @kernel(inline=True)
 def _end_of(line: I4, x: int, end: int, mark: int) -> int:
-    """Return the first column from ``x`` to ``end`` with another mark; ``end`` if there is none.
+    """Return the first column from ``x`` on whose mark is not ``mark``, but at most ``end``.
 
     ``line`` (width,) are the marks of a row.
     """

@@ -61,7 +61,7 @@ def find_horizontal_planes(
 def _measure_candidates(
     grid: DepthGrid, samples: DepthSamples, planes: Iterable[F8]
 ) -> list[PlaneCandidate]:
-    """Measure planes (a, b, c) on their inliers; leave out planes of little visible area."""
+    """Measure planes (a, b, c) on their inliers; leave out those below `PLANES.min_area_m2`."""
     candidates = (measure_candidate(grid, samples, plane) for plane in planes)
     return [candidate for candidate in candidates if candidate.plane.area_m2 >= PLANES.min_area_m2]
 

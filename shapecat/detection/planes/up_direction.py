@@ -158,7 +158,10 @@ def _ransac_direction(normals: F4, trials: F8, best: F8) -> int:
 
 @kernel(fast=True, inner=True)
 def _count_facing(normals: F4, direction: F8, start: int, stop: int) -> int:
-    """Count the normals (3, n) near ``direction`` (3,), from ``start`` to before ``stop``."""
+    """Count the normals (3, n) near ``direction`` (3,), from ``start`` to before ``stop``.
+
+    Near means a cosine above `UpSettings.facing_cos`.
+    """
     xs, ys, zs = normals[0], normals[1], normals[2]  # unpacked they would not be contiguous
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     min_cos, inliers = np.float32(UP.facing_cos), np.int32(0)

@@ -85,8 +85,8 @@ def _next_run(plane_ids: I4, row: int, j: int, last: int) -> tuple[int, int]:
     """Return the first column, and one past the last, of the next run of cells above one plane.
 
     Gaps narrower than `SegmentationSettings.bridged` are included. The search begins at column
-    ``j``. ``plane_ids`` are as in `HeightMap`, flattened. There must be
-    an object cell before ``last``; ``row`` is the index of the first cell of the row.
+    ``j``. ``plane_ids`` are as in `HeightMap`, flattened. There must be an object cell before
+    ``last``; ``row`` is the index of the first cell of the row.
     """
     while plane_ids[row + j] <= 0:
         j += 1

@@ -92,14 +92,14 @@ def _min_size(sizes: I4, n: int) -> tuple[int, int]:
 def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4) -> None:
     """Grow labels (rows, columns) along links, in place, over flat cells first.
 
-    Flat cells have small concave angles. There is a queue for each range of angles, as a linked
-    list: ``following`` holds the successor of each cell, -1 for the last one. The heads of the
-    queues come after the cells. The other parameters are as in `SurfaceGraph`.
+    Flat cells have small concave angles. There is a queue of cells for each range of angles, as a
+    linked list. The other parameters are as in `SurfaceGraph`.
     """
     columns, size = labels.shape[1], labels.size
     angle, flat = concavity.reshape(-1), labels.reshape(-1)
     directions = unset(size, np.uint8)
     _find_directions(links.reshape(-1), flat, spans, columns, directions)
+    # The successor of each cell in its queue, -1 for the last; then the heads of the queues.
     following = unset(size + BUCKETS, np.int32)
     following[size:] = -1
     last = np.arange(size, size + BUCKETS)
@@ -123,7 +123,7 @@ def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4) -> None:
 
 @kernel(inline=True)
 def _find_directions(links: U1, labels: I4, spans: I4, columns: int, directions: U1) -> None:
-    """Write bits for the directions in which each cell (n,) is linked with an unlabelled one.
+    """Write bits for the directions in which each cell (n,) is linked with an unlabelled cell.
 
     ``links`` and ``labels`` are flattened, ``spans`` as in `SurfaceGraph`; the bits are `RIGHT`,
     `DOWN`, `LEFT` and `UP`. The loops vectorise, because unsigned indices need no check for
