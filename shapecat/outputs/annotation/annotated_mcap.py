@@ -60,12 +60,14 @@ def write_annotated(
 
     Each frame, with or without objects, gets a message on ``/shapecat/scene`` and, for ROS, on
     ``/shapecat/detections``. Messages have the stamp, frame id and log time of the frame. The
-    metadata record ``shapecat`` holds ``run`` as JSON under ``run.json``. The file gets its name
-    when it is complete.
+    file gets its name when it is complete.
 
     Parameters
     ----------
+    path : the file to write.
     frames : the boxes to show in each frame, in the order of the recording.
+    run : the content of run.json. The metadata record ``shapecat`` holds it as JSON, under the key
+        ``run.json``.
     markers : whether to write ``/shapecat/markers`` for RViz, if the encoding is a ROS encoding.
     images : the boxes to show on the colour images, in the order of the recording. They are
         written to ``/shapecat/image_annotations`` and, for ROS, ``/shapecat/detections_2d``, with
@@ -144,7 +146,7 @@ def _append(
     items: Iterable[EncodedMessage],
     metadata: Mapping[str, str],
 ) -> None:
-    """Write the annotations after the end of the original data section."""
+    """Write annotations and metadata after the original data section, and then a new summary."""
     file.seek(summary.data_end)
     compression = summary.chunks[0].compression if summary.chunks else "zstd"
     with Appender(file, summary, compression) as appender:
@@ -176,8 +178,8 @@ def _annotations(frames: Iterable[AnnotationFrame]) -> Iterator[Annotation]:
 def _with_periods(frames: Iterable[AnnotationFrame]) -> Iterator[tuple[AnnotationFrame, int]]:
     """Yield each frame with the time to the next frame of its topic, ns.
 
-    If that is not among the next `_AHEAD` frames, it is the time since the previous one, or else
-    `_PERIOD_NS`.
+    If none of the next `_AHEAD` frames is of the same topic, the time since the topic's previous
+    frame takes its place, or `_PERIOD_NS` if there is no previous frame.
     """
     source = iter(frames)
     following = deque(islice(source, _AHEAD))
@@ -203,7 +205,8 @@ def _period(frame: AnnotationFrame, following: AnnotationFrame) -> int:
 def _encoding(recording: Recording, first: Annotation | None) -> str:
     """Return the encoding for annotations: that of the first frame's topic, or the most common.
 
-    It is CDR for a ROS 1 bag, which is converted to ROS 2, and JSON if none is supported.
+    Only `ENCODINGS` count; JSON is the default. For a ROS 1 bag, which is converted to ROS 2, the
+    encoding is CDR.
     """
     if recording.kind == "ros1":
         return "cdr"

@@ -159,7 +159,7 @@ def _colour(kind: str, box: AnnotationBox, alpha: float, t: Types) -> Any:
 
 
 def text_position(box: AnnotationBox) -> tuple[float, float, float]:
-    """Return the position (x, y, z) of the text just above a box, metres, frame of the box."""
+    """Return the position (x, y, z) of the text just above a box, metres, sensor frame."""
     x, y, z = box.center
     qx, qy, qz, qw = box.orientation
     rise = box.size[2] / 2 + 0.03

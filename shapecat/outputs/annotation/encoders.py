@@ -153,7 +153,7 @@ ENCODINGS: dict[str, Callable[[], _Encoding]] = {
     "json": _json,
     "protobuf": _protobuf,
 }
-"""For each encoding, the function that makes it.
+"""For each encoding, the function that makes its `_Encoding`.
 
 Annotations have the encoding of the recording: ROS tools fail on a file with mixed encodings.
 """

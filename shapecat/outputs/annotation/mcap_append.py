@@ -134,7 +134,7 @@ class Appender:
 
         Raises
         ------
-        OSError : all channel numbers are taken.
+        OSError : the highest possible number of a channel or schema is taken.
         """
         schema_id = max(self._schemas, default=0) + 1
         schema = records.Schema(
@@ -223,7 +223,7 @@ class Appender:
         )
 
     def _flush(self, waiting: int) -> None:
-        """Submit the chunk if it has messages; wait until ``waiting`` or fewer chunks are left."""
+        """Submit the chunk if it has messages; wait until at most ``waiting`` are unwritten."""
         if self._chunk.entries:
             self._waiting.append(self._writer.submit(self._write_chunk, self._chunk))
             self._chunk = _Chunk()

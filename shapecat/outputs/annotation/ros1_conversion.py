@@ -56,7 +56,9 @@ def convert_channel(channel: Channel) -> _ConvertedChannel | None:
 
     Types keep their definition from the bag. Only fields whose names ROS 2 does not allow are
     renamed: ``O_T_EE`` becomes ``o_t_ee``, and ``K`` of CameraInfo becomes ``k``, as ROS 2 itself
-    names it. The sequence numbers of headers are lost, since ROS 2 has none.
+    names it. ``tf/tfMessage`` becomes ``tf2_msgs/TFMessage``, and a latched topic gets the
+    corresponding quality of service. The sequence numbers of headers are lost, since ROS 2 has
+    none.
 
     Returns
     -------
