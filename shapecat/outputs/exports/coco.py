@@ -24,8 +24,8 @@ Images = Iterable[tuple[str, FinishedRun, DatasetImage]]
 def write_coco(out: Path, images: Images, categories: Sequence[str]) -> int:
     """Write images/SPLIT/ and annotations/instances_SPLIT.json; return the number of objects.
 
-    Masks are compressed run lengths. Objects with an uncertain label have ``iscrowd`` set, so that
-    evaluation ignores them, and are not counted. ``track_id`` is unique in the data set.
+    Masks are compressed run lengths. Objects without a reliable label have ``iscrowd`` set, so
+    that evaluation ignores them, and are not counted. ``track_id`` is unique in the data set.
     ``attributes`` holds the run, the track number in that run, ``occluded`` (another object hides a
     part) and ``truncated`` (the border of the depth image cuts the object, and thus its mask).
     """
@@ -99,7 +99,7 @@ def write_yolo(out: Path, images: Images, categories: Sequence[str]) -> int:
     """Write images/SPLIT/, labels/SPLIT/ and data.yaml; return the number of objects.
 
     The format allows one polygon per object: the parts of an object are linked, and holes are
-    filled. Objects with an uncertain label are left out.
+    filled. Objects without a reliable label are left out.
     """
     count, splits = 0, set()
     for split, _, image in images:

@@ -23,16 +23,17 @@ from shapecat.system.files import holding
 __all__ = ["Origin", "write_crops"]
 
 _INSTANCE = re.compile(r".*\.([0-9a-f]{12})(?:\.([\d.]+)-([\d.]+|inf))?\.track-\d+", re.DOTALL)
-
+"""Name of an instance that is from a run: the run, its `Origin`, and the track."""
 _LONGEST_NAME = 255
-"""Maximum length of the name of a folder, bytes: 60 characters of any script, and some accents."""
+"""Maximum length of a folder name, bytes: enough for a category of 60 characters in any script."""
 
 
 class Origin(NamedTuple):
     """Source and time range of the views of a run, independent of the name of the run.
 
-    ``source`` is a digest of the recording and the topics; ``start_s`` and ``end_s`` bound the time
-    range, seconds.
+    Comparing origins shows which views in a data set may be from the same frames. ``source`` is a
+    digest of the recording and the topics. ``start_s`` and ``end_s`` (exclusive, or infinite) are
+    in seconds after the start of the recording.
     """
 
     source: str
@@ -51,7 +52,7 @@ class Origin(NamedTuple):
 
     @classmethod
     def read(cls, instance: str) -> "Origin | None":
-        """Return the origin in the name of an instance; None if the instance is not from a run."""
+        """Return the origin in the folder name of an instance; None if it is not from a run."""
         if match := _INSTANCE.fullmatch(instance):
             return cls(match[1], float(match[2] or 0), float(match[3] or "inf"))
         return None
@@ -118,7 +119,7 @@ def _write_views(out: Path, frames: Iterable[PairedFrame], finished: FinishedRun
 
 
 def _earlier_views(out: Path, origin: Origin) -> list[Path]:
-    """Return the instances that a new export of the same frames replaces.
+    """Return the folders of the instances that a new export of the same frames replaces.
 
     Raises
     ------

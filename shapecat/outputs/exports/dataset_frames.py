@@ -77,7 +77,7 @@ class DatasetImage:
 
 
 class DatasetObject(NamedTuple):
-    """An object, its mask, and whether its label is certain enough for training."""
+    """An object, its mask, and whether its label is reliable enough for training (``sure``)."""
 
     item: LabelledObject
     mask: Mask
@@ -87,8 +87,8 @@ class DatasetObject(NamedTuple):
 def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
     """Return ``train`` or ``val`` for each run; runs of the same recording are in the same split.
 
-    Recordings are drawn in the order of hashes of their content, so that further runs change few
-    splits. At least one recording goes to the training split.
+    Recordings are taken for validation in the order of hashes of their content, so that adding runs
+    changes few splits. At least one recording goes to the training split.
 
     Parameters
     ----------
@@ -124,13 +124,13 @@ def images_of(
 ) -> Iterator[DatasetImage]:
     """Yield the images of a run with at least one object to train on; log damaged images.
 
-    The images also list objects whose label is not certain enough, but no unknown objects.
+    The images also list objects whose label is not reliable, but no unknown objects.
 
     Parameters
     ----------
     recording : path of the recording; None means the path where it was processed.
     stems : the prefix of the image names of each topic.
-    left_out : counter to which frames without such an image are added, by reason.
+    left_out : counter to which selected frames without such an image are added, by reason.
     observe : called after each frame of the run, even if it is left out.
 
     Raises
@@ -160,7 +160,7 @@ def images_of(
 
 
 def _is_sure(item: LabelledObject, selection: ImageSelection, corrected: set[int]) -> bool:
-    """Return whether the label of an object is certain enough for training; *unknown* never is.
+    """Return whether the label of an object is reliable enough for training; *unknown* never is.
 
     ``corrected`` are the numbers of the tracks that a person labelled.
     """
@@ -202,7 +202,7 @@ _File = tuple[str, bytes, tuple[int, int], tuple[Mask, ...]]
 def _colour_file(frame: Frame, coloured: Coloured | None) -> _File | None:
     """Return suffix, content, (height, width) and masks of a colour image.
 
-    The result is None without an image, or if it only holds the colours of an unorganized cloud.
+    The result is None without an image, or if the image is the colours of an unorganized cloud.
     """
     if coloured is None or coloured.view.image.height <= 1:
         return None
@@ -222,7 +222,10 @@ def _depth_file(labelled: LabelledFrame, frame: Frame) -> _File | None:
 
 
 def snapped_masks(frame: Frame, coloured: Coloured, pixels: U1) -> tuple[Mask, ...]:
-    """Return the masks of a frame with outlines moved to edges of its colour image (h, w, 3)."""
+    """Return the masks of a frame with outlines moved to edges of its colour image.
+
+    ``pixels`` (h, w, 3) are those of the image.
+    """
     lens, camera, scale = coloured.view.lens, frame.camera, 1.0
     if not coloured.view.registered and lens is not None and camera is not None:
         scale = lens.pinhole.fx / camera.fx
@@ -232,9 +235,9 @@ def snapped_masks(frame: Frame, coloured: Coloured, pixels: U1) -> tuple[Mask, .
 def _chosen(
     finished: FinishedRun, selection: ImageSelection, corrected: set[int]
 ) -> set[tuple[str, int]]:
-    """Return the selected frames, by topic and number.
+    """Return topic and number of the frames to export.
 
-    Of the frames with the same colour image, only the one nearest to it in time is selected.
+    Of the frames that share a colour image, only the nearest to the image in time is exported.
     """
     best: dict[tuple[str, int, int], tuple[int, tuple[str, int], list[tuple[int, F8]]]] = {}
     for labelled in thinned(finished.frames(), selection.every):
@@ -279,7 +282,7 @@ def _view_features(labelled: LabelledFrame, item: LabelledObject) -> F8:
     """Return features (8,) of a view, scaled so that their differences are comparable.
 
     They are the direction to the sensor (3), in the fixed frame if there is a pose; the logarithms
-    of distance and number of pixels; and the relative lengths of the box (3).
+    of distance and number of pixels; and the sides of the box relative to the longest (3).
     """
     pose, center = labelled.fixed_from_sensor, np.asarray(item.box.center, np.float64)
     distance = float(np.linalg.norm(center))
@@ -293,8 +296,7 @@ def _view_features(labelled: LabelledFrame, item: LabelledObject) -> F8:
 def _different(views: F8, count: int) -> list[int]:
     """Return the indices of up to ``count`` views that differ most, by farthest-point sampling.
 
-    ``views`` (n, 8) are from `_view_features`. The first to be chosen is the one with the most
-    pixels.
+    ``views`` (n, 8) are from `_view_features`. The view with the most pixels is chosen first.
     """
     chosen = [int(views[:, 4].argmax())]
     apart = np.linalg.norm(views - views[chosen[0]], axis=1)

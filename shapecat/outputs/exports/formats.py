@@ -54,8 +54,8 @@ class Exported:
 
     Attributes
     ----------
-    objects : number of objects labelled for training, summed over all images.
-    uncertain : the same for visible objects without a reliable label, except unknown ones.
+    objects : number of objects with a reliable label, summed over all images.
+    uncertain : number of the other objects with a mask, except unknown ones.
     images : number of images in each split.
     """
 
@@ -97,7 +97,7 @@ def export_run(
     format : a key of `FORMATS`.
     every : export every n-th frame of a stream.
     visible_boxes : whether boxes enclose the visible part of objects instead of the whole.
-    categories : the categories of all runs that are exported together; they are numbered alike.
+    categories : those of all runs that are exported together, which then number them alike.
     recording : path of the recording; None means the path where it was processed.
     observe : called with the phase, the number of frames done, and the total.
 
@@ -183,7 +183,7 @@ def _labelled_images(
     recording: Path | None,
     observe: Observer,
 ) -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
-    """Yield a data set's images with split and run, and count them; raise `OutputError` if none."""
+    """Yield images with split and run; count them in ``counts``. Raise `OutputError` if none."""
     total = sum(int(run.info["counts"]["frames"]) for run in runs)
     done, left_out = itertools.count(1), Counter[str]()
     splits = split_runs(runs, selection.val)
@@ -210,7 +210,7 @@ def common_categories(runs: Sequence[FinishedRun]) -> tuple[str, ...]:
 
     Raises
     ------
-    OutputError : two runs spell a category differently.
+    OutputError : two categories differ only in upper and lower case.
     """
     names = order_categories(name for run in runs for name in run.categories)
     spelled: dict[str, str] = {}

@@ -68,7 +68,12 @@ def write_kitti(out: Path, frames: Iterable[PairedFrame], finished: FinishedRun)
 
 
 def _require_distinct_types(categories: Iterable[str]) -> None:
-    """Raise an error if readers that ignore case cannot tell the types of two categories apart."""
+    """Check that even readers that ignore case can tell the types of the categories apart.
+
+    Raises
+    ------
+    OutputError : the types of two categories differ at most in case.
+    """
     types: dict[str, str] = {}
     for name in categories:
         if (other := types.setdefault(kitti_type(name).lower(), name)) != name:
@@ -95,14 +100,20 @@ def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
 
 
 class _View(NamedTuple):
-    """Camera of 2D boxes and ``P2`` (None without an image); ``pose`` is ``camera_from_sensor``."""
+    """The camera to which 2D boxes and ``P2`` refer, and ``pose``: ``camera_from_sensor``.
+
+    ``camera`` is None for a cloud without a colour image.
+    """
 
     camera: Camera | None
     pose: Pose
 
 
 def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None) -> _View:
-    """Write the colour image of a frame, if any; return its camera, or else the depth camera."""
+    """Write the colour image of a frame, if any; return its camera, or else the depth camera.
+
+    A damaged image is logged and counts as missing.
+    """
     depth_view = _View(frame.camera, IDENTITY)
     if coloured is None or coloured.view.image.height <= 1:
         return depth_view
@@ -130,7 +141,7 @@ def kitti_type(category: str) -> str:
 def _label(item: LabelledObject, frame: Frame, turn: F8, view: _View) -> str:
     """Return a line of 15 values: type truncated occluded alpha bbox(4) h w l x y z rotation_y.
 
-    ``turn`` (3, 3) is from `rectified_from_sensor`.
+    They are in pixels, metres and radians. ``turn`` (3, 3) is from `rectified_from_sensor`.
     """
     length, width, height = map(float, item.box.size)
     x, y, z = turn @ item.box.center
@@ -147,7 +158,7 @@ def _label(item: LabelledObject, frame: Frame, turn: F8, view: _View) -> str:
 
 
 def _pixels(item: LabelledObject, frame: Frame, view: _View) -> tuple[float, ...]:
-    """Return left, top, right and bottom of an object, pixels; all -1 if it is not visible."""
+    """Return left, top, right and bottom (inclusive) of an object, pixels; -1 if not visible."""
     camera, nowhere = view.camera, (-1.0, -1.0, -1.0, -1.0)
     if camera is None or not item.indices.size:
         return nowhere
