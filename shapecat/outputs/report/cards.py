@@ -25,7 +25,7 @@ from shapecat.types import UNKNOWN
 __all__ = ["Card", "TrackCounts", "asset", "card_html", "count_cards", "frame_html", "template"]
 
 _LINES = 3  # categories in a timeline
-_MOST_STEPS = 80
+_MOST_STEPS = 80  # points of each line in a timeline
 _DIGITS = 9  # the last digit key
 _ROOMY = 4  # largest number of boxes whose full labels fit in a frame of the strip
 
@@ -82,7 +82,7 @@ def card_html(card: Card, categories: Sequence[str], names: Sequence[str], end: 
 
     Parameters
     ----------
-    categories : in the order of the posterior.
+    categories : the categories of the model, in the order of the posterior.
     names : all categories, unknown first; the digit keys 0 to 9 assign the first ten.
     end : time at the end of the last track, seconds since the first frame.
     """
@@ -150,8 +150,8 @@ def _facts(card: Card) -> list[str]:
 def _bars(line: Timeline, categories: Sequence[str], row: TrackRow, names: Sequence[str]) -> str:
     """Return a button for each category, the most likely first, with a bar for its posterior.
 
-    ``categories`` and ``names`` are as in `card_html`. If the track has a category that is not in
-    ``categories``, except unknown, its button is the last one.
+    ``categories`` and ``names`` are as in `card_html`. A category of the track that is not in
+    ``categories``, except unknown, has the last button.
     """
     shares = dict(zip(categories, line.fused.tolist(), strict=False))
     order = sorted(shares, key=lambda name: -shares[name])
@@ -176,7 +176,7 @@ def _bar(name: str, share: float, digit: str) -> str:
 
 
 def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
-    """Return an SVG plot of the highest causal posteriors, with the times of detection below.
+    """Return an SVG plot of the `_LINES` highest causal posteriors above the times of detection.
 
     It is empty if ``end`` is 0, as for a single frame.
     """
@@ -207,12 +207,15 @@ def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
 
 
 def _few(count: int) -> I4:
-    """Return at most `_MOST_STEPS` of ``count`` indices, including the first and the last."""
+    """Return at most `_MOST_STEPS` of ``count`` indices, evenly spaced from first to last."""
     return np.unique(np.linspace(0, count - 1, min(count, _MOST_STEPS)).round().astype(int))
 
 
 def _spans(seconds: F8, visible: Bool, scale: float) -> list[tuple[float, float]]:
-    """Return start and end, multiplied by ``scale``, of each interval of unbroken detection."""
+    """Return start and end, multiplied by ``scale``, of each interval of unbroken detection.
+
+    ``seconds`` and ``visible`` are ``seconds`` and ``seen`` of a `Timeline`.
+    """
     changes = np.diff(visible.astype(int), prepend=0, append=0)
     starts, ends = np.flatnonzero(changes == 1), np.flatnonzero(changes == -1) - 1
     return [(seconds[a] * scale, seconds[b] * scale) for a, b in zip(starts, ends, strict=True)]

@@ -28,7 +28,7 @@ _STRIP = 12
 _PARTIAL = 0.2
 """Weight of a view that is cut off by the image border or partly occluded."""
 _COLOURLESS = 0.05
-"""Weight of a view without a mask on a colour image."""
+"""Weight of a view without a mask on a colour image; its size is then its number of points."""
 
 
 @dataclass(frozen=True)
@@ -123,10 +123,10 @@ def _representative_views(views: Sequence[_View]) -> list[_View]:
 def _strip(
     stamps: Sequence[tuple[int, Key]], tracks_of: Mapping[Key, set[int]]
 ) -> dict[Key, float]:
-    """Return one frame of each part of a run, with its seconds since the first frame.
+    """Return a frame of each of `_STRIP` parts of a run, with its seconds since the first frame.
 
-    It is the frame with the most tracks that no earlier frame of the strip shows. Among equal
-    frames, it is the one with the most tracks, then the one nearest to the middle of the part.
+    It is the frame with the most tracks that no earlier frame of its topic in the strip shows.
+    Among equal frames, the one with the most tracks is taken, then the one nearest to the middle.
     ``stamps`` are the stamp (ns) and the key of each frame, sorted by time; ``tracks_of`` are the
     tracks detected in each frame.
     """

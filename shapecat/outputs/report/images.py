@@ -96,7 +96,10 @@ class Crop(NamedTuple):
 def prepare_picture(
     labelled: LabelledFrame, frame: Frame, coloured: Coloured | None
 ) -> FramePicture | None:
-    """Return a frame prepared for pictures; None for a cloud that no virtual camera can show."""
+    """Return a frame prepared for pictures; None for a cloud that no virtual camera can show.
+
+    If the colour image is damaged, the depth image is shown.
+    """
     organized = _organized(labelled, frame)
     if organized is None:
         return None
@@ -250,7 +253,8 @@ def worth_of(image: FramePicture, number: int) -> float:
 
     The score is the product of four factors: the size (square root of the mask area, saturating at
     160 pixels); the fraction of the outline off the image border, squared; the unoccluded fraction
-    of the outline, squared; and the sharpness (below 1; 0.5 without a colour image).
+    of the outline, squared; and the sharpness (below 1; 0.5 without a colour image). An object
+    without visible pixels scores 0.
 
     Parameters
     ----------

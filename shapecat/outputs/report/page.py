@@ -38,8 +38,8 @@ _SCRIPTS = ("labels.js", "meaning.js", "saving.js", "cards.js", "frames.js", "ke
 class Listed:
     """A run in the index.
 
-    ``warnings`` is the number of warnings on its page; ``faces`` are pictures of some of its tracks
-    as data URIs.
+    ``link`` is the address of its page, ``info`` the content of its run.json, and ``warnings`` the
+    number of warnings on its page; ``faces`` are pictures of some of its tracks as data URIs.
     """
 
     link: str
@@ -67,7 +67,7 @@ def run_page(
     ----------
     cards : the tracks, in the order of the table.
     frames : the frames of the strip.
-    stages : (frames,) seconds of each stage.
+    stages : (n,) seconds of each stage in the frames in which it ran.
     length_s : time from the first to the last frame, seconds.
     notes : warnings to show after those of the run.
     index : link to the index of several runs; None if there is none.
@@ -128,7 +128,7 @@ def index_page(title: str, runs: Sequence[Listed], notes: Sequence[str] = ()) ->
 
 
 def _head(title: str, scripts: str = "") -> str:
-    """Return the head of a page; ``scripts`` is added to its content security policy."""
+    """Return the head of a page; ``scripts`` are added to its content security policy."""
     filled = template("head.html").substitute(
         title=escape(title), style=asset("report.css"), scripts=scripts
     )
@@ -163,7 +163,7 @@ def _strip(frames: Sequence[StripFrame], cards: Sequence[Card]) -> str:
 
 
 def _chips(finished: FinishedRun, cards: Sequence[Card], tally: TrackCounts) -> str:
-    """Return a filter for each category of a track, in the order of the run's categories."""
+    """Return a filter for each category that a track has, in the order of the run's categories."""
     deleted = {card.row.category for card in cards if card.row.track not in finished.labels}
     filters = tally.categories.keys() | deleted  # a deleted track keeps its filter
     names = (UNKNOWN, *finished.categories)

@@ -31,9 +31,10 @@ __all__ = ["Pictures", "StripFrame", "TrackPictures", "take_pictures"]
 
 
 class TrackPictures(NamedTuple):
-    """The best view of a track: crop, drawings of the surface, and size of the full box in metres.
+    """The best view of a track: crop, drawings of the surface, and size of the box in metres.
 
-    ``crop`` is None if the recording cannot be read, or if no pixel shows the object.
+    ``crop`` is None if the recording cannot be read, or if no pixel shows the object. The box is
+    the full box, or the visible box if the full box is unknown.
     """
 
     crop: Crop | None

@@ -85,7 +85,7 @@ class _Site:
         return _Answer(HTTPStatus.NOT_FOUND, "no such page")
 
     def post(self, address: str, body: bytes) -> _Answer:
-        """Write a label to tracks.csv; return all labels, and the reason if this one is refused."""
+        """Write a label to tracks.csv; return all labels, and the reason if it was refused."""
         report, name = self._find(address)
         if report is None or name != _LABELS:
             return _Answer(HTTPStatus.NOT_FOUND, "no such page")
@@ -98,7 +98,7 @@ class _Site:
         return _Answer(status, {"labels": _labels(report), "problem": problem})
 
     def _find(self, address: str) -> tuple[RunReport | None, str]:
-        """Return the run whose folder contains an address, or None, and the resource's name."""
+        """Return the run whose folder contains ``address``, or None, and the resource's name."""
         place, _, name = address.rpartition("/")
         for report in self.reports.runs:
             if unquote(self.reports.link(report)) == f"{place}/{PAGE}".lstrip("/"):

@@ -116,7 +116,8 @@ def _view(azimuth: float, elevation: float) -> F8:
 def _project(points: F8, view: F8, scale: float) -> F8:
     """Return column, row and nearness to the viewer (n, 3), pixels, of points (n, 3).
 
-    ``view`` (3, 3) is from `_view`; ``scale`` is in pixels per metre.
+    ``points`` are in metres, with the origin at the centre of the picture. ``view`` (3, 3) is from
+    `_view`; ``scale`` is in pixels per metre.
     """
     right, up, toward_viewer = (np.asarray(points, np.float64) @ view.T * scale).T
     return np.stack([SIDE / 2 + right, SIDE / 2 - up, toward_viewer], axis=1)
@@ -171,7 +172,10 @@ def _closed(nearness: F8) -> F8:
 
 
 def _smoothed(nearness: F8, bare: Bool) -> F8:
-    """Average each pixel (h, w), even an empty one (``bare``), with those nearby on the object."""
+    """Average each pixel (h, w), even an empty one (``bare``), with those nearby on the object.
+
+    The result is 0 where the object is not nearby.
+    """
     weight: F8 = (~bare).astype(np.float64)
     value: F8 = np.where(bare, 0.0, nearness)
     for _ in range(_PASSES):

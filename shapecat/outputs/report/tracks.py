@@ -14,7 +14,7 @@ Detected = tuple[str, int, int]
 
 
 class Timeline(Record):
-    """A track over time.
+    """A track over time: its rows in tracks.parquet, by stamp.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Timeline(Record):
 
 
 def read_timelines(folder: Path) -> dict[int, Timeline]:
-    """Read the timeline of every track of a run."""
+    """Read the timeline of every track of a run, by track number."""
     start = first_stamp(folder)
     with opened(folder / "tracks.parquet") as file:
         table = file.read()
@@ -55,7 +55,7 @@ def read_timelines(folder: Path) -> dict[int, Timeline]:
 
 
 def read_stage_seconds(folder: Path) -> dict[str, F8]:
-    """Return the seconds (frames,) that each stage took in the frames of a run."""
+    """Return the seconds (n,) that each stage took, one value for each frame in which it ran."""
     seconds_by_stage: dict[str, list[float]] = {}
     for group in read_row_groups(folder / "frames.parquet", ["stages", "seconds"]):
         for row in group.to_pylist():

@@ -46,7 +46,7 @@ class RunReport:
     Attributes
     ----------
     work : the id ``work`` in run.json, which shows whether the run has been replaced.
-    stages : (frames,) seconds of each stage.
+    stages : (n,) seconds of each stage in the frames in which it ran.
     length_s : time from the first to the last frame, seconds.
     index : link to the index of several runs; None if there is none.
     """
@@ -142,7 +142,7 @@ class Reports:
         """Return the page that lists the runs, with their current labels.
 
         A run that is gone or has an invalid table is left out; its own page says why. Runs of the
-        same name are listed with their folders.
+        same name are listed with their folders. A warning names the recordings that failed.
         """
         cards = []
         for report in self.runs:
@@ -227,7 +227,7 @@ def read_report(folder: Path, *, index: str | None = None) -> RunReport:
 
 
 def _failed_recordings(manifest: Path) -> set[str]:
-    """Return the names of run folders that failed in a batch; none if the manifest is missing."""
+    """Return the folder names of recordings that failed in a batch; empty without a manifest."""
     states: dict[str, str] = {}
     with suppress(OSError), manifest.open("rb") as lines:
         for line in lines:
