@@ -44,7 +44,8 @@ def paint(
     Depth images are thinned to a grid of pixels, clouds to every k-th point. Objects are thinned
     less; they get up to half of the points. Points on objects have the colour of the category,
     points on planes a muted colour, and all others are grey. Depth images are shaded as if lit from
-    above the camera. Points that a colour camera sees have their true colours, tinted on objects.
+    above left of the camera. Points that a colour camera sees have their true colours, unshaded,
+    and tinted on objects.
 
     Parameters
     ----------

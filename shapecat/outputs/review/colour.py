@@ -30,7 +30,7 @@ def true_colours(
     pixels : (n,) flat indices of the points in the frame.
     pitch : approximate distance of neighbouring points, pixels of the frame.
     palette : (k, 3) colours.
-    tones : (n,) index of the colour that tints each point; 0 for none.
+    tones : (n,) index into ``palette`` of the colour that tints each point; 0 for none.
 
     Raises
     ------

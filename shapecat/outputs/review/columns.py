@@ -48,7 +48,7 @@ class Columns:
         self._buffers: dict[str, _Buffer] = {}
 
     def add(self, entity: str, at: At, row: Any, drawing: Drawing, *, size: int = 1) -> None:
-        """Add a row of an entity; the first one also writes its style.
+        """Add a row of an entity; the first row also writes the style of the entity.
 
         Parameters
         ----------

@@ -41,7 +41,7 @@ def _file_of(image: ColourImage) -> tuple[bytes, str]:
 
 
 def mask_layer(visible: Sequence[tuple[LabelledObject, Mask]], height: int, width: int) -> bytes:
-    """Return the masks on an image of this size, in pixels, as a translucent PNG.
+    """Return a PNG (height, width) of the masks, translucent in the colours of the categories.
 
     Rerun would not compress a segmentation image.
     """
@@ -60,7 +60,7 @@ _Boxes = tuple[F4, list[tuple[int, int, int]], list[str]]
 
 
 class Images:
-    """Writes the frames' colour images; ``entities`` maps Rerun entity paths to their titles."""
+    """Writes the frames' colour images; ``entities`` maps their Rerun entity paths to titles."""
 
     def __init__(self, columns: Columns) -> None:
         """Start without images."""

@@ -91,7 +91,7 @@ def _first_seen(labelled: LabelledFrame) -> int:
 
 
 def _places(labelled: LabelledFrame, *, fixed: bool) -> dict[int, F8]:
-    """Return each track's position (3,), metres, in the sensor frame.
+    """Return the centre (3,) of each track's box, metres, in the sensor frame.
 
     If ``fixed`` and the pose is known, it is in the fixed frame.
     """

@@ -52,7 +52,7 @@ _TrackPath = tuple[str, F8]
 
 
 class DrawnScene(NamedTuple):
-    """A frame to draw; ``points`` are those on objects, ``rest`` are all others."""
+    """A frame to draw; ``points`` holds the points on objects, ``rest`` all others."""
 
     labelled: LabelledFrame
     rest: PaintedCloud
@@ -60,13 +60,16 @@ class DrawnScene(NamedTuple):
 
     @property
     def size(self) -> int:
-        """The number of points plus the number of pixels in the ``indices`` of the objects."""
+        """The size for `Columns.add`: the number of points plus the number of pixels of objects."""
         pixels = sum(o.indices.size for o in self.labelled.objects)
         return len(self.rest.points) + len(self.points.points) + pixels
 
 
 class Sketch(NamedTuple):
-    """The box and texts of an object, which are drawn in every frame."""
+    """The box and texts of an object, which are drawn in every frame.
+
+    ``label`` is the text of the box, ``caption`` the shorter text above it.
+    """
 
     box: Box
     category: str
@@ -255,7 +258,10 @@ def pinhole(camera: Camera) -> rr.Pinhole:
 
 
 def markdown(values: Mapping[str, object], level: int = 1) -> str:
-    """Return nested values as Markdown lists, and headings from level ``level + 1`` to 6."""
+    """Return values as a Markdown list; nested values have headings and lists of their own.
+
+    Headings start at ``level + 1``; the deepest level is 6.
+    """
     lines = [
         f"- **{key}**: {_inline(v)}" for key, v in values.items() if not isinstance(v, Mapping)
     ]

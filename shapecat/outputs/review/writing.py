@@ -69,7 +69,7 @@ from shapecat.types import Camera, Frame, LabelledFrame, Pose
 
 __all__ = ["write_review"]
 
-_FLUSH_FRAMES = 32
+_FLUSH_FRAMES = 32  # frames written between two flushes
 
 
 def write_review(
