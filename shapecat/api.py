@@ -176,9 +176,10 @@ def process(
     every : process every n-th frame.
     model : path of a model file; None for the model that comes with shapecat.
     config : path of a TOML file with settings.
-    overwrite : whether to replace other results; corrected labels are transferred.
+    overwrite : whether to replace earlier results; corrected labels are transferred.
     discard_labels : with ``overwrite``, whether to drop corrected labels.
-    color : topic of the colour images; None to choose one, empty to use none.
+    color : topic of the colour images for all depth topics; None to choose one for each, empty to
+        use none.
     mcap, rrd : whether to write annotated.mcap and review.rrd.
     cores : number of processes that perceive frames. If there are several, a script must have
         ``if __name__ == "__main__":``.

@@ -25,7 +25,7 @@ _AHEAD = 4
 
 @dataclass(frozen=True)
 class Coloured:
-    """The colour image of a frame, and the mask of each object of the frame, in order."""
+    """The colour image of a frame, and the mask on it of each object of the frame, in order."""
 
     view: ColourView
     masks: tuple[Mask, ...]

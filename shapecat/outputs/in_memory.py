@@ -20,7 +20,7 @@ from shapecat.types import Camera, Detection, Frame, LabelledFrame, LabelledObje
 __all__ = ["frame_of", "perceive_alone"]
 
 _FARTHEST_M = 100.0
-"""Median of depths, or of each point's largest coordinate, above which they are not in metres."""
+"""The unit is not metres if the median depth, or largest coordinate of a point, is above this."""
 _FIXED = ([0, 1, 2, 2, 2], [1, 0, 0, 1, 2])
 """Rows and columns of the elements that are 0 or 1 in every camera matrix without skew."""
 _SHORTEST = 0.05
@@ -36,7 +36,8 @@ def frame_of(reading: ArrayLike | Frame, intrinsics: ArrayLike | Camera | None =
 
     Raises
     ------
-    ConfigError : the shape, the type or a number is wrong, or the unit is not metres.
+    ConfigError : the shape, type or unit is wrong, or the intrinsics are implausible or come with a
+        frame.
     """
     if isinstance(reading, Frame):
         if intrinsics is not None:
@@ -58,7 +59,7 @@ def frame_of(reading: ArrayLike | Frame, intrinsics: ArrayLike | Camera | None =
 
 
 def _points(values: np.ndarray, masked: Bool) -> F4:
-    """Return points (n, 3) as float32, NaN where a coordinate is masked or not finite.
+    """Return points (n, 3) as float32; all NaN if a coordinate is masked or not finite.
 
     ``values`` and ``masked`` are (n, 3) or (h, w, 3).
 

@@ -53,7 +53,7 @@ class Table:
             return tuple(pq.read_schema(self.path).names)
 
     def arrow(self, columns: str | Iterable[str] | None = None) -> pa.Table:
-        """Read the table, or some columns, as an Arrow table; a name alone is one column.
+        """Read the table, or only ``columns`` (names, or a single name), as an Arrow table.
 
         Raises
         ------
@@ -90,8 +90,8 @@ class Table:
     def numpy(self, column: str) -> Any:
         """Read a column as an array: (n,) for numbers or text, (n, k) for lists of equal length.
 
-        Lists of different lengths become an object array of arrays. Null becomes NaN, or a row of
-        NaN. Errors are those of `arrow`.
+        Lists of different lengths become an object array of arrays. A missing number becomes NaN, a
+        missing list a row of NaN. Errors are those of `arrow`.
         """
         chunks = self.arrow([column])[column]
         if pa.types.is_fixed_size_list(chunks.type):
@@ -172,12 +172,15 @@ class RunFrame:
         return mask.full(image.height, image.width)
 
     def points_of(self, item: LabelledObject) -> F4:
-        """Return the points (n, 3) of an object, metres, sensor frame."""
+        """Return the points (n, 3) of an object, metres, sensor frame; NaN if depth is missing."""
         return self.reading.xyz(item.indices)
 
 
 class Run:
-    """A finished run: its tables, its tracks with their final labels, and its frames."""
+    """A finished run: its tables, its tracks with their final labels, and its frames.
+
+    The tables are ``detections``, ``tracks``, ``planes`` and ``frame_table`` (a row per frame).
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -256,8 +259,8 @@ class Run:
         Raises
         ------
         RecordingError : the recording is missing or unreadable.
-        OutputError : its content has changed since it was processed, a table is unreadable, or the
-            run has been replaced since it was opened.
+        OutputError : the recording has changed since it was processed, a table is unreadable, or
+            the run has been replaced since it was opened.
         """
         moved = None
         if recording is not None:

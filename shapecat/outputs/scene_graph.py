@@ -14,7 +14,7 @@ from shapecat.types import Candidate, Plane, Scene
 __all__ = ["Node", "format_tree"]
 
 _ON_TOP_M = 0.04
-"""Largest difference in height of an object's top and a plane that is this top, metres."""
+"""Largest difference in height between an object's top and a plane fitted to this top, metres."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,10 @@ def _below_object(candidate: Candidate) -> Sequence[Node | None]:
 
 
 def _below_plane(scene: Scene, k: int) -> Node | None:
-    """Return the object whose top is plane k, else the highest plane below k's middle, or None."""
+    """Return the object whose top is plane ``k``, or else the highest plane below its middle.
+
+    The result is None if there is neither.
+    """
     middle = scene.planes[k].outline.mean(axis=0)
     level = gravity_rotation(scene.up)[:2]
     for n, candidate in enumerate(scene.candidates):

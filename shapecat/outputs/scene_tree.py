@@ -143,8 +143,8 @@ def _apply_labels(
 ) -> tuple[Scene, dict[int, LabelledObject]]:
     """Join the parts of merged objects, and leave deleted candidates out.
 
-    An object on a deleted one now stands on what was below the deleted one. A merged object stands
-    where its lowest part stands.
+    An object on a deleted one now stands on the support of the deleted one. A merged object stands
+    on the support of its lowest part.
 
     Parameters
     ----------
