@@ -41,7 +41,8 @@ def _reserve(file: BinaryIO, length: int) -> None:
     """Reserve disk space for ``length`` bytes, and some for annotations.
 
     A full disk then raises an OSError early. Without reserved space, ext4 would write out the whole
-    file when the file is renamed over an older one, which takes as long as the copy.
+    file when the file is renamed over an older one, which takes as long as the copy. Where the
+    system cannot reserve space, nothing is done.
     """
     if not hasattr(os, "posix_fallocate"):
         return

@@ -51,6 +51,8 @@ class Choice:
 
 
 class _View(NamedTuple):
+    """A detection of a track; ``worth`` is its size in pixels, less if it is not complete."""
+
     key: Key
     worth: float
     complete: bool
