@@ -61,7 +61,7 @@ class Job:
     model_id : id that the model must have; empty for any.
     color : topic of the colour images; None to choose one, empty for none.
     mcap, rrd : whether to write annotated.mcap and review.rrd.
-    overwrite : whether to replace results of another input, settings or model.
+    overwrite : whether to replace earlier results.
     discard_labels : whether to discard the labels of the replaced results.
     origin : URL from which ``source`` is downloaded; empty if none.
     target : URL to which the results are uploaded; empty if none.
