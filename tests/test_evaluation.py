@@ -46,7 +46,7 @@ from shapecat.evaluation.page import (
     format_page,
     write_page,
 )
-from shapecat.evaluation.report import Compared, _accuracy_over, evaluate
+from shapecat.evaluation.report import Compared, _accuracy_by_range, evaluate
 from shapecat.evaluation.training import (
     fit_views,
     learn_on_folder,
@@ -490,7 +490,7 @@ def test_accuracies_over_ranges_match_hand_calculation() -> None:
     """A view at a limit is in the upper range; a range without views is left out."""
     values, right = np.array([2.0, 1.0, 5.5, 1.5, 2.9, 5.0]), np.array([1, 1, 1, 0, 1, 0], bool)
 
-    assert _accuracy_over(values, right, (1, 2, 3, 5, math.inf), " m") == (
+    assert _accuracy_by_range(values, right, (1, 2, 3, 5, math.inf), " m") == (
         ("1-2 m", 2, 0.5),
         ("2-3 m", 2, 1.0),
         ("5 m or more", 2, 0.5),

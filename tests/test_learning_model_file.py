@@ -84,7 +84,7 @@ def test_model_file_is_reproducible(saved: Path, tmp_path: Path) -> None:
     assert second.read_bytes() == saved.read_bytes()
 
 
-@pytest.mark.parametrize("limit", ["_LARGEST_FILE", "_LARGEST_PART"])
+@pytest.mark.parametrize("limit", ["_LARGEST_FILE", "_LARGEST_CONTENT"])
 def test_too_large_models_replace_nothing(
     saved: Path, monkeypatch: pytest.MonkeyPatch, limit: str
 ) -> None:
@@ -227,8 +227,8 @@ def test_claimed_array_size_is_not_allocated(saved: Path) -> None:
 
 def test_zip_bomb_is_not_unpacked(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The test lowers the limit, since packing more than 128 MB would take a second."""
-    assert model_file._LARGEST_PART == 128 << 20
-    monkeypatch.setattr(model_file, "_LARGEST_PART", 8 << 20)
+    assert model_file._LARGEST_CONTENT == 128 << 20
+    monkeypatch.setattr(model_file, "_LARGEST_CONTENT", 8 << 20)
     content = bytes(9 << 20)
     with zipfile.ZipFile(saved, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr("leaf_values.npy", content)

@@ -167,9 +167,11 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
         skipped=views.skipped,
         off_support=views.off_support,
         calibration=metrics.calibration_curve(truth, posteriors),
-        by_distance=_accuracy_over(views.distances[known], truth == predicted, _DISTANCES_M, " m"),
-        by_points=_accuracy_over(views.points[known], truth == predicted, _POINTS, ""),
-        by_elevation=_accuracy_over(elevations[known], truth == predicted, _ELEVATIONS, "°"),
+        by_distance=_accuracy_by_range(
+            views.distances[known], truth == predicted, _DISTANCES_M, " m"
+        ),
+        by_points=_accuracy_by_range(views.points[known], truth == predicted, _POINTS, ""),
+        by_elevation=_accuracy_by_range(elevations[known], truth == predicted, _ELEVATIONS, "°"),
         fused=fuse_views(truth, posteriors, views.instances[known]),
     )
 
@@ -200,7 +202,9 @@ def _novelty_figures(unknown: F4, known: F4) -> dict[str, float | None]:
     }
 
 
-def _accuracy_over(values: np.ndarray, right: Bool, edges: Sequence[float], unit: str) -> Ranges:
+def _accuracy_by_range(
+    values: np.ndarray, right: Bool, edges: Sequence[float], unit: str
+) -> Ranges:
     """Return (range, views, accuracy) for each range [low, high) between ``edges`` that has views.
 
     ``values`` (n,) is the quantity of each view, in ``unit``; ``right`` (n,) is whether its

@@ -28,7 +28,7 @@ __all__ = ["load_model", "require_model_path", "save_model"]
 _FORMAT = "shapecat-model"
 _VERSION = 3
 _LARGEST_FILE = 64 << 20
-_LARGEST_PART = 128 << 20
+_LARGEST_CONTENT = 128 << 20
 """Maximum sizes of a file, and of all its unpacked members together, bytes."""
 _HEADER = "header.json"
 
@@ -54,7 +54,7 @@ def save_model(path: Path, categorizer: Categorizer) -> None:
             np.lib.format.write_array(content, np.ascontiguousarray(little), allow_pickle=False)
             _write_member(archive, f"{name}.npy", content.getvalue())
         unpacked = sum(item.file_size for item in archive.infolist())
-    if buffer.tell() > _LARGEST_FILE or unpacked > _LARGEST_PART:
+    if buffer.tell() > _LARGEST_FILE or unpacked > _LARGEST_CONTENT:
         msg = (
             f"{path}: the model is too large ({buffer.tell() >> 20} MB, unpacked "
             f"{unpacked >> 20} MB); learn fewer categories"
@@ -167,7 +167,7 @@ def _read_members(content: bytes) -> dict[str, bytes]:
 
 
 def _unpack(archive: zipfile.ZipFile) -> dict[str, bytes]:
-    members, left = {}, _LARGEST_PART
+    members, left = {}, _LARGEST_CONTENT
     for item in archive.infolist():
         if item.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
             msg = f"{item.filename} has an unknown compression"
@@ -176,7 +176,7 @@ def _unpack(archive: zipfile.ZipFile) -> dict[str, bytes]:
             data = stream.read(left + 1)
         left -= len(data)
         if left < 0:
-            msg = f"it unpacks to more than {_LARGEST_PART >> 20} MB"
+            msg = f"it unpacks to more than {_LARGEST_CONTENT >> 20} MB"
             raise _NotAModelError(msg)
         members[item.filename] = data
     return members

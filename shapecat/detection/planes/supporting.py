@@ -71,7 +71,9 @@ def supporting_planes(
     supports: list[SupportingPlane] = []
     for plane, inliers, covered_m2 in candidates:
         area_m2 = plane.area_m2 + covered_m2
-        drops = [plane.offset - lower.offset for lower in supports if _is_centred_on(lower, plane)]
+        drops = [
+            plane.offset - lower.offset for lower in supports if _contains_centre(lower, plane)
+        ]
         drop = drops[-1] if drops else math.inf
         high = max_height_m < drop < math.inf
         if drop < PLANES.min_drop_m:
@@ -109,7 +111,7 @@ def _is_top(
     return bool(above < PLANES.bare_share * inside)
 
 
-def _is_centred_on(lower: SupportingPlane, upper: SupportingPlane) -> bool:
+def _contains_centre(lower: SupportingPlane, upper: SupportingPlane) -> bool:
     """Return whether the middle (Steiner point) of ``upper`` is over the inside of ``lower``."""
     x, y = upper.extent @ COS * 2 / DIRECTIONS, upper.extent @ SIN * 2 / DIRECTIONS
     return bool(np.all(COS * x + SIN * y < lower.extent))

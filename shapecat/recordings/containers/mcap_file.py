@@ -160,7 +160,7 @@ class McapRecording(ChunkedRecording):
             return
         if record.opcode == Opcode.CHUNK:
             yield from self._split(record)
-        elif record.opcode in _DEFINING or record.opcode not in _KNOWN:
+        elif record.opcode in _READ_OUTSIDE_CHUNKS or record.opcode not in _KNOWN:
             try:
                 yield from self._take(record.opcode, memoryview(self.content(record)))
             except ChunkError as error:
@@ -268,5 +268,5 @@ _KNOWN = {int(opcode) for opcode in Opcode} | set(range(128, 256))
 """Opcodes that cause no warning. The MCAP specification leaves 128 to 255 to applications."""
 _END = (Opcode.DATA_END, Opcode.FOOTER)
 """Opcodes of the records that end the data."""
-_DEFINING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+_READ_OUTSIDE_CHUNKS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 """Opcodes of the records whose content is also read outside chunks."""

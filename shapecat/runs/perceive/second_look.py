@@ -98,7 +98,9 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
     revisions: dict[Key, Revision] = {}
     for topic, stream in _streams(tables).items():
         posed = np.isfinite(stream.rotation[:, 0, 0])
-        expected = _fixed_up(stream, posed) if 2 * posed.sum() > len(posed) else _still_up(stream)
+        expected = (
+            _fixed_up(stream, posed) if 2 * posed.sum() > len(posed) else _up_of_neighbours(stream)
+        )
         off = ~stream.has_plane | ~(_cosine(stream.up, expected) > _cos(_OFF_DEG))
         off |= ~posed & _lacks_usual_support(stream, off)
         agrees = _cosine(stream.given, expected) > _cos(_AGREES_DEG)
@@ -121,7 +123,7 @@ def _fixed_up(stream: _Stream, posed: Bool) -> F8:
     return np.asarray(np.einsum("nji,j->ni", stream.rotation, agreed))
 
 
-def _still_up(stream: _Stream) -> F8:
+def _up_of_neighbours(stream: _Stream) -> F8:
     """Return the up direction (n, 3), sensor frame, on which the frames around each frame agree.
 
     It is NaN where these are too few, or disagree, as when the camera moves.
