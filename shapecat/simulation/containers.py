@@ -109,7 +109,7 @@ FormatName = Literal["mcap", "ros1", "ros2"]
 
 
 class Format(NamedTuple):
-    """A recording format: the suffix of its files, and the function that opens a new recording."""
+    """A recording format: its suffix, empty for a folder, and the function that opens a recording."""
 
     suffix: str
     open: Callable[[Path], Container]

@@ -30,8 +30,8 @@ def written_paths(out: Path, format: str) -> list[Path]:  # noqa: A002  the word
 def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[list[Path]]:
     """Provide hidden paths; if the block succeeds, move the files written there to ``paths``.
 
-    The ``obsolete`` files, which an earlier recording may have left, are deleted, too. The first
-    path is that of the recording.
+    The first path is that of the recording. Then delete the ``obsolete`` files, which an earlier
+    recording may have left.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[li
 
 
 def require_replaceable(path: Path) -> list[Path]:
-    """Return the files of a folder that a recording may replace; none if it is not a folder.
+    """Check that a recording may replace a path; return the files in it if it is a folder.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def _move(hidden_path: Path, path: Path) -> None:
 
 @contextmanager
 def label_file(path: Path, frames: int, camera: Camera) -> Iterator[Callable[[U1], None]]:
-    """Open a compressed .npz file of pixel labels; provide a function that adds those of a frame.
+    """Open a compressed .npz file; provide a function that adds the pixel labels (h, w) of a frame.
 
     The function must be called once for each of the ``frames`` frames. The only array in the file
     is ``labels`` (frames, h, w), uint8; ``camera`` gives h and w.

@@ -17,16 +17,17 @@ LISTED_PIXELS = 100
 AMBIGUOUS_PIXELS = 250
 """Objects with fewer visible depth pixels than this have an ambiguous category."""
 AMBIGUOUS_SHARE = 0.4
-"""The category of an object is also ambiguous if it has less than this fraction of the pixels that
-it would have if nothing occluded it."""
+"""The category is also ambiguous if an object has less than this fraction of the pixels that it
+would have if nothing occluded it."""
 
 
 def frame_truth(world: World, frame: int, labels: U1, camera: Camera) -> dict[str, Any]:
     """Return the ground truth of a frame as JSON values.
 
     The keys are ``objects``, ``hidden`` (objects with fewer than `LISTED_PIXELS` depth pixels) and
-    ``planes`` (the supports that hold objects). Boxes and planes are in the optical frame; the
-    ``center`` of an object and the ``height`` of a plane are in the world frame; metres.
+    ``planes`` (the supports that hold objects). Absent objects are left out. Boxes and planes are
+    in the optical frame; the ``center`` of an object and the ``height`` of a plane are in the world
+    frame; metres.
 
     Parameters
     ----------
@@ -56,7 +57,10 @@ def frame_truth(world: World, frame: int, labels: U1, camera: Camera) -> dict[st
 def _object_truth(
     world: World, frame: int, item: PlacedObject, pixels: int, share: float
 ) -> dict[str, Any]:
-    """Return the truth of an object with ``pixels`` pixels; its fraction ``share`` is visible."""
+    """Return the truth of an object: ``pixels`` of its pixels, the fraction ``share``, are visible.
+
+    While the object is lifted, nothing supports it.
+    """
     world_from_camera, pose = world.path[frame], world.pose_of(item, frame)
     camera_from_world = inverse(world_from_camera)
     carried = pose.translation[2] > item.pose.translation[2]
@@ -87,7 +91,7 @@ def _object_truth(
 
 
 def _plane_truth(support: Support, camera_from_world: Pose, pixels: int) -> dict[str, Any]:
-    """Return the truth of a support's surface, which has ``pixels`` pixels."""
+    """Return the truth of a support's surface, of which ``pixels`` pixels are visible."""
     normal = camera_from_world.rotation[:, 2]
     point = transform(camera_from_world, support.outline[0])
     return {

@@ -24,9 +24,10 @@ MARGIN_DISCONTINUITY = 0.07
 
 
 def displace_edges(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4]:
-    """Displace the edges of the true image at random; matching windows also round their corners.
+    """Displace the depth edges of a rendered image at random, as a depth camera does.
 
-    Returns the inverse depth (1/m), mesh ids and cosines, all (h, w).
+    If the sensor has a stereo matching window, it also rounds the corners of outlines. Returns the
+    inverse depth (1/m), mesh ids and cosines, all (h, w); the image does not change.
 
     Source: Barron and Malik 2013.
     """
@@ -62,8 +63,9 @@ def _sample_beside(
 ) -> None:
     """Displace the edges of an image; write the result to ``out``, ``ids_out`` and ``cos_out``.
 
-    ``inverse``, ``mesh_ids`` and ``cosine`` (h, w) are the image; ``across`` and ``down`` (h, w)
-    are the displacements, pixels. A pixel displaced within its surface keeps its value.
+    Each pixel of the result shows the pixel of the image that is ``across`` columns and ``down``
+    rows (h, w) away, or its own if both show the same surface. ``inverse``, ``mesh_ids`` and
+    ``cosine`` (h, w) are the image.
     """
     height, width = inverse.shape
     for v in range(height):
@@ -129,9 +131,9 @@ def _match_windows(
 
 @kernel
 def drop_margins(inverse: F8, width: int, lost: Bool) -> None:
-    """Mark in ``lost`` (h, w) pixels at most ``width`` rows and columns from a nearer surface.
+    """Set ``lost`` (h, w) to True beside nearer surfaces, where stereo matching fails.
 
-    ``inverse`` (h, w) is the inverse depth, 1/m.
+    These margins are ``width`` pixels wide; ``inverse`` (h, w) is the inverse depth, 1/m.
     """
     height, columns = inverse.shape
     nearest = np.zeros(inverse.shape)
@@ -152,9 +154,10 @@ def drop_margins(inverse: F8, width: int, lost: Bool) -> None:
 
 @kernel
 def _blend(inverse: F8, radius: int, out: F8) -> None:
-    """Write to ``out`` inverse depth (h, w), averaged over windows whose middle row has an edge.
+    """Write inverse depth (h, w) to ``out``, averaged over windows at depth edges, else unchanged.
 
-    A window extends ``radius`` pixels to each side. Elsewhere, the inverse depth is copied.
+    The window of a pixel extends ``radius`` pixels to each side; in its middle row, it must contain
+    an edge. Pixels without depth are not averaged, and windows must lie within the image.
     """
     height, width = inverse.shape
     for v in range(height):

@@ -59,7 +59,7 @@ def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
 
 
 def _inverse_depth_error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
-    """Return the error (h, w) of the inverse depth before quantization, 1/m."""
+    """Draw the error of the inverse depth before quantization; both are (h, w), 1/m."""
     error = np.zeros(inverse.shape, np.float32)
     if sensor.noise > 0:
         error += noise(
@@ -90,7 +90,10 @@ def _scaled_by_reflectance(cosine: F4, mesh_ids: I4, sensor: Sensor) -> F4:
 
 
 def _drop_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> None:
-    """Mark oblique surfaces as ``lost``; ``cosine`` (h, w) is the cosine of the incidence angle."""
+    """Set ``lost`` (h, w) to True on oblique and dark surfaces, with random borders.
+
+    ``cosine`` (h, w) is from `_scaled_by_reflectance`.
+    """
     if sensor.grazing_cosine > 0:
         window = (sensor.hole_px, sensor.hole_px)
         threshold_noise = noise(cosine.shape, window, 0.5 * sensor.grazing_cosine, rng)
@@ -98,7 +101,7 @@ def _drop_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> Non
 
 
 def _drop_border(sensor: Sensor, lost: Bool) -> None:
-    """Mark the blank border of the sensor as ``lost`` (h, w)."""
+    """Set ``lost`` (h, w) to True in the sensor's margins without depth."""
     left, right, top, bottom = sensor.border_px
     lost[:top] = True
     lost[len(lost) - bottom :] = True
@@ -107,7 +110,7 @@ def _drop_border(sensor: Sensor, lost: Bool) -> None:
 
 
 def _drop_random_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
-    """Mark random holes as ``lost`` (h, w)."""
+    """Set ``lost`` (h, w) to True in random holes."""
     area = 0.32 * (sensor.hole_px + 2) ** 2  # about the mean of width times height
     count = rng.poisson(sensor.holes * lost.size / area) if sensor.holes > 0 else 0
     rows = rng.integers(0, lost.shape[0], count)
@@ -118,9 +121,10 @@ def _drop_random_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
 
 
 def _smoothed(inverse: F8, width: int, limit: float) -> F8:
-    """Average inverse depth (h, w) over windows that end at discontinuities of ``limit``, 1/m.
+    """Average inverse depth (h, w) over windows ``width`` pixels wide and high.
 
-    This rounds the edges and corners of surfaces. The windows are ``width`` pixels wide and high.
+    The windows end at discontinuities of at least ``limit``, 1/m. So edges and corners within a
+    surface become round, but depth edges stay.
     """
     for _ in range(2):  # along the rows, then along the columns
         along = np.zeros_like(inverse)
@@ -154,10 +158,10 @@ def _write_depth(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, mesh
 
 @kernel
 def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
-    """Mark pixels whose points are occluded from a second viewpoint beside the camera.
+    """Set ``shadow`` to True where points are occluded from a second viewpoint beside the camera.
 
-    ``inverse`` is the inverse depth, 1/m; the marks go to ``shadow``, both (h, w). ``shift`` is the
-    viewpoint's x position in metres times the focal length in pixels.
+    ``inverse`` is the inverse depth, 1/m; both are (h, w). ``shift`` is the viewpoint's x position
+    in metres times the focal length in pixels.
     """
     height, width = inverse.shape
     margin = int(abs(shift) * 5) + 2
@@ -188,7 +192,7 @@ def _fill_shadow(inverse: F8, mesh_ids: I4, shadow: Bool, growth_px: I4) -> None
     """Extend the surface on the nearer side of a shadow into the shadow, as stereo matching does.
 
     ``inverse``, ``mesh_ids`` and ``shadow`` (h, w) are changed in place. ``growth_px`` (h // 3 + 1,
-    16) holds the widths of the extension, which vary over the image.
+    16) holds the widths of the extension: one for each 3 rows and 8 columns, repeated across.
     """
     height, width = inverse.shape
     for v in range(height):
@@ -218,8 +222,8 @@ def _fill_shadow(inverse: F8, mesh_ids: I4, shadow: Bool, growth_px: I4) -> None
 def _smooth(inverse: F8, radius: int, limit: float, out: F8) -> None:
     """Write to ``out`` the inverse depth (h, w), averaged along rows.
 
-    The average extends ``radius`` pixels to each side, but ends at discontinuities of ``limit``,
-    1/m.
+    The average extends ``radius`` pixels to each side, but ends at discontinuities of at least
+    ``limit``, 1/m.
     """
     height, width = inverse.shape
     for v in range(height):

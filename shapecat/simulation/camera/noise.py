@@ -19,9 +19,10 @@ def noise(
     *,
     smoothings: int = 1,
 ) -> F4:
-    """Return nearly normal noise (h, w), correlated over a window (across, down) in pixels.
+    """Draw nearly normal noise (h, w) of mean 0, correlated over a window (across, down) in pixels.
 
-    The noise is a sum of random bytes, which are many times faster to draw than normal numbers.
+    The noise is a sum of random bytes, which are many times faster to draw than normal numbers;
+    with a window of one pixel, it is uniform.
 
     Parameters
     ----------
@@ -62,7 +63,7 @@ def fixed_error(shape: tuple[int, int], deviation: float, spacing: int, device: 
     ----------
     deviation : standard deviation, 1/m.
     spacing : distance over which the error varies, pixels.
-    device : seed.
+    device : seed, which determines the error.
     """
     knots = (shape[0] // spacing + 2, shape[1] // spacing + 2)
     heights = np.random.default_rng(device).normal(0, 1.5 * deviation, knots)

@@ -109,7 +109,7 @@ def pixels_if_unoccluded(
     """Count the pixels that mesh ``mesh_id`` would have if nothing occluded it.
 
     Pixels up to one image width or height beyond the image border count, too. The result is 0 if a
-    vertex has a depth below `NEAR_M`. ``scene`` and ``frame_from_camera`` are as for `render`.
+    vertex has a depth of at most `NEAR_M`. ``scene`` and ``frame_from_camera`` are as for `render`.
     """
     triangles = scene.triangles[scene.mesh_ids == mesh_id]
     if len(triangles) == 0:
@@ -155,9 +155,9 @@ def _rasterize(
     """Find the nearest triangle of each pixel, and the normal of each triangle.
 
     ``points`` (n, 3) are in the optical frame, metres; ``intrinsics`` are fx, fy, cx, cy in pixels.
-    Where a pixel shows a triangle, write its inverse depth (1/m) into ``nearest`` (h, w), and its
-    index into ``triangle_ids`` (h, w). Write the unit normals of the triangles, pointing away from
-    the camera, into ``normals`` (m, 3).
+    Where a pixel shows a triangle, write the inverse depth (1/m) into ``nearest`` (h, w), 0 on
+    entry, and the triangle's index into ``triangle_ids`` (h, w). Write the unit normals of these
+    triangles, pointing away from the camera, into ``normals`` (m, 3).
     """
     height, width = nearest.shape
     fx, fy, cx, cy = intrinsics
