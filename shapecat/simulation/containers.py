@@ -109,7 +109,7 @@ FormatName = Literal["mcap", "ros1", "ros2"]
 
 
 class Format(NamedTuple):
-    """A recording format: its suffix, empty for a folder, and the function that opens a recording."""
+    """A format: suffix of the file, empty for a folder, and function that opens a new recording."""
 
     suffix: str
     open: Callable[[Path], Container]

@@ -76,7 +76,7 @@ def make_own_arms(rng: Generator, camera: Pose, height: float) -> list[Mesh]:
 def make_resting_arms(
     rng: Generator, camera: Pose, intrinsics: Camera, height: float
 ) -> list[Mesh]:
-    """Return arms that enter the image from its border, and lie on a support or just above it.
+    """Return the parts of arms that enter the image from its border, on or just above a support.
 
     Parameters
     ----------
@@ -98,9 +98,10 @@ def make_resting_arms(
 
 
 def _on_support(uv: ArrayLike, camera: Pose, intrinsics: Camera, height: float) -> F8:
-    """Return the point (3,) of a support that a pixel shows, at a depth of at most 2 m.
+    """Return the point (3,) where the ray of a pixel meets a support, in the world frame, metres.
 
-    ``uv`` is the column and the row of the pixel, as fractions of the image size. ``camera`` and
+    The result is at most at a depth of 2 m, even if the ray is then still above the support. ``uv``
+    is the column and the row of the pixel, as fractions of the image size. ``camera`` and
     ``height`` are as for `make_resting_arms`.
     """
     u, v = np.asarray(uv, float) * [intrinsics.width, intrinsics.height]
@@ -113,7 +114,10 @@ def _on_support(uv: ArrayLike, camera: Pose, intrinsics: Camera, height: float) 
 
 
 def _resting_arm(rng: Generator, start: F8, end: F8) -> list[Mesh]:
-    """Return a forearm on a support, from ``start`` (3,) to a hand or gripper at ``end`` (3,)."""
+    """Return the parts of a forearm just above a support, with a hand or gripper.
+
+    It extends from above ``start`` (3,) to above ``end`` (3,), points of the support.
+    """
     thick, rise, gap = rng.uniform(0.03, 0.08), rng.uniform(0, 0.25), rng.uniform(-0.005, 0.05)
     kind = rng.random()
     if kind < 0.25:
@@ -147,7 +151,7 @@ def _links(joints: Sequence[F8], radii: Sequence[float]) -> list[Mesh]:
 
 
 def _gripper(rng: Generator, hand: F8, tip: F8) -> list[Mesh]:
-    """Return a palm at ``hand`` (3,) and two fingers that point down to ``tip`` (3,)."""
+    """Return a palm below ``hand`` (3,), and two fingers down to the height of ``tip`` (3,)."""
     turn, wide = rng.uniform(0, 180), rng.uniform(0.03, 0.09)
     tall = float(hand[2] - tip[2])
     palm = placed(rounded_box([wide + 0.05, 0.05, 0.5 * tall]), [0, 0, 0.45 * tall])
@@ -267,7 +271,7 @@ def make_keyboard(rng: Generator) -> Mesh:
 
 
 def _above(place: F8, height: float) -> F8:
-    """Return the position (3,) at ``height`` metres above another."""
+    """Return the position (3,) ``height`` metres above ``place`` (3,)."""
     return np.asarray(place + np.array([0.0, 0.0, height]))
 
 

@@ -47,7 +47,7 @@ def footprint(mesh: Mesh, world_from_mesh: Pose) -> Footprint:
 
 
 def overlap(a: F8, b: F8, gap: float) -> bool:
-    """Return whether two convex outlines ``a`` (k, 2) and ``b`` (m, 2) are closer than ``gap``.
+    """Return whether two convex outlines, (k, 2) and (m, 2), are closer than ``gap``, metres.
 
     Outlines that are nearest at two corners may count as closer than they are.
 
@@ -75,7 +75,10 @@ def inside(points: F8, outline: F8, margin: float) -> bool:
 
 
 def _normals(outline: F8) -> F8:
-    """Return the outward unit normals (m, 2) of an outline (k, 2), without those of empty sides."""
+    """Return the outward unit normals (m, 2) of the sides of an outline (k, 2) that have a length.
+
+    The corners are counter-clockwise.
+    """
     edge = np.roll(outline, -1, axis=0) - outline
     normals = np.stack([edge[:, 1], -edge[:, 0]], -1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -84,7 +87,10 @@ def _normals(outline: F8) -> F8:
 
 
 def _hull(points: F8) -> F8:
-    """Return the corners (k, 2) of the convex hull of points (n, 2), or the ends of a line."""
+    """Return the corners (k, 2) of the convex hull of points (n, 2), counter-clockwise.
+
+    If the points are on a line, return its two ends; for a single point, these are equal.
+    """
     spread = (
         np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) > 2 else [0]
     )

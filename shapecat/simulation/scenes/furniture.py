@@ -127,7 +127,7 @@ def make_tote(rng: Generator, supports: Sequence[Support]) -> list[Support]:
 def _rim(half: F8, wide: float, height: float) -> Iterator[Support]:
     """Yield the four boards of a rim, ``wide`` metres wide, around a bin.
 
-    ``half`` (2,) is half the length and width of the bin; ``height`` is that of its top.
+    ``half`` (2,) is half the length and width of the bin; the rim lies at ``height``, on its top.
     """
     for name, axis, side in (("left", 0, -1), ("right", 0, 1), ("near", 1, -1), ("far", 1, 1)):
         size, place = 2 * half + 2 * wide, np.zeros(2)
@@ -190,5 +190,5 @@ def _board(name: str, label: int, size: Sequence[float], place: Sequence[float])
 
 
 def as_equipment(name: str, meshes: Sequence[Mesh]) -> list[Support]:
-    """Return meshes in the world frame as supports that hold no objects."""
+    """Return meshes in the world frame as supports ``name_0``, ``name_1``... without objects."""
     return [Support(f"{name}_{k}", EQUIPMENT, mesh) for k, mesh in enumerate(meshes)]

@@ -72,8 +72,8 @@ def make_scene(
     Parameters
     ----------
     frames, rate_hz : number of frames, and frames per second; the objects do not depend on them.
-    categories : categories to draw from; each appears at least once if the scene has room for
-        enough objects.
+    categories : categories to draw from; none is drawn twice before all have been drawn. Some
+        scenes add distractors, or moving objects of other categories.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def _turntable(rng: Generator, spec: _SceneSpec) -> World:
 
 
 def _empty(rng: Generator, spec: _SceneSpec) -> World:
-    """Return a scene of an empty table."""
+    """Return a scene with a table and no objects."""
     room, table = make_room(rng, wall_chance=0.5), make_table(rng)
     target = np.array([0, 0, table.height])
     path = arc_orbit(

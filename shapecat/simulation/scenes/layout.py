@@ -22,7 +22,7 @@ _LYING = {"can": 0.2, "bottle": 0.22, "cup": 0.12, "box": 0.7}
 _UPSIDE_DOWN = {"cup": 0.06, "bowl": 0.06, "plate": 0.03}
 """Probability that an open object stands on its rim."""
 _WIDEST_M = 0.42
-"""Maximum length and width of an object."""
+"""Maximum length and width of an object; larger ones are not placed."""
 SUPPORTING = {"box", "can"}
 """Categories that other objects are stacked on."""
 _SMALLEST_TOP_M = 0.035
@@ -48,8 +48,8 @@ class Piece(Record):
 def make_piece(category: str, rng: Generator) -> Piece:
     """Make a random object with a random resting pose.
 
-    ``category`` is one of the shape categories, or ``unknown`` for a distractor, which stays
-    upright.
+    ``category`` is one of the shape categories, or ``unknown`` for a distractor. Balls, distractors
+    and objects without a stable pose of the drawn kind stay upright.
     """
     if category == UNKNOWN:
         kind, mesh = make_distractor(rng)
@@ -69,9 +69,9 @@ def place_piece(
 
     Parameters
     ----------
-    pose : ``world_from_mesh``, in its stable pose.
-    support : the support that it stands on, unless it stands on another object.
-    on_track : number of the object that it stands on, if any.
+    pose : ``world_from_mesh`` of the piece, placed in its stable pose.
+    support : the support below the piece.
+    on_track : number of the object that the piece stands on; None if it stands on ``support``.
     """
     resting_pose = piece.stable_pose.name
     return PlacedObject(
@@ -96,13 +96,13 @@ def _draw_resting_pose(category: str, rng: Generator) -> str:
 
 
 class Layout:
-    """Objects on supports, placed one by one.
+    """Objects on supports, placed one by one without overlap; ``objects`` lists them.
 
     Parameters
     ----------
-    gap : minimum distance between footprints, metres.
+    gap : minimum distance between footprints, metres; may change between objects.
     headroom : maximum height of an object's top above its support, metres.
-    enclosed : whether objects must stay within the edges of their support.
+    enclosed : whether no part of an object may extend beyond the edges of its support.
     """
 
     def __init__(
@@ -226,6 +226,6 @@ class Layout:
 
 
 def _supports(below: Footprint, above: Footprint) -> bool:
-    """Return whether the middle 60 % of the upper contact area lies on the top face below."""
+    """Return whether the middle 60 % of the contact area of ``above`` is on top of ``below``."""
     middle = above.contact.mean(axis=0)
     return inside(middle + 0.6 * (above.contact - middle), below.top, 0.002)

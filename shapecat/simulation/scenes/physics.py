@@ -35,7 +35,7 @@ _STILL = 0.02
 _CHECK_STEPS = 12
 """Simulation steps between two checks that everything is at rest."""
 _WAITING_M = 5.0
-"""Distance from the scene at which objects wait to be dropped."""
+"""Minimum x, and y, of the positions where objects wait to be dropped, far from the scene."""
 
 
 class Drop(NamedTuple):
@@ -165,7 +165,7 @@ def _pose(data: Any, k: int) -> Pose:
 
 
 def _settled_poses(mujoco: Any, model: Any, data: Any, count: int) -> list[SettledPose]:
-    """Return the settled pose of each object; the largest upward force on it tells its support."""
+    """Return the settled pose of each object, supported by what pushes it upwards the most."""
     model.opt.enableflags = 0  # sleeping bodies have no contacts
     mujoco.mj_forward(model, data)
     upward_force = np.zeros((count, count + 1))  # the last column: obstacles

@@ -25,8 +25,8 @@ _UPRIGHT = 0.45
 _TILT_DEG = 8.0
 """Standard deviation of the tilt of nearly upright objects about x and about y."""
 _UPRIGHT_COS, _LYING_COS = np.cos(np.radians(15)), np.sin(np.radians(15))
-"""Cosines of the angles between an axis and the vertical at 15 degrees from upright, and from
-lying."""
+"""Cosines of the angle between an axis and the vertical: minimum of an upright axis (15 degrees),
+and maximum of a lying axis (75 degrees)."""
 _FALLEN_M = 0.02
 """Objects this far below the surface of their support have fallen off."""
 
@@ -153,7 +153,7 @@ def settled(
 ) -> tuple[PlacedObject, ...]:
     """Drop items onto supports; return the objects that come to rest on the support ``below``.
 
-    The objects are numbered from 0 in the order of ``items``; ``drops`` says how each is dropped.
+    The objects are numbered from 0 in the order of ``items``; ``drops`` has one drop per item.
     Objects that reach ``highest_m`` metres or more above the surface of ``below`` are left out, and
     so is everything that rests on them.
     """
@@ -176,7 +176,10 @@ def settled(
 
 
 def _rests_on(mesh: Mesh, landed: SettledPose, below: Support, highest_m: float) -> bool:
-    """Return whether an object lies on a support and reaches less than ``highest_m`` above it."""
+    """Return whether an object came to rest on a support, directly or on top of others.
+
+    Its top must be less than ``highest_m`` metres above the support.
+    """
     points = transform(landed.pose, mesh.vertices)
     low, high = points.min(axis=0), points.max(axis=0)
     edge = below.outline[:, :2]
@@ -192,7 +195,10 @@ def _placed_object(
     below: Support,
     tracks: F8,
 ) -> PlacedObject:
-    """Return an item where it has landed; ``tracks`` are the tracks of all items."""
+    """Return an item with the number ``track`` in its settled pose ``landed``.
+
+    ``tracks`` (n,) are the numbers of all items, meaningless for those that are left out.
+    """
     supported_by = landed.supported_by
     axes = landed.pose.rotation[2]  # world z component of each axis of the object
     return PlacedObject(

@@ -72,7 +72,7 @@ def _walls(rng: Generator) -> Iterator[Support]:
 
 
 def _arms(rng: Generator, table: Support) -> Iterator[Mesh]:
-    """Yield the parts of a robot arm and of a person's arm that reach over the table."""
+    """Yield the parts of a robot arm, a person's arm, both or none, which reach over the table."""
     top = table.height
     if rng.random() < 0.75:
         beside = rng.choice([-1, 1]) * rng.uniform(0.35, 0.6)

@@ -85,7 +85,7 @@ def rows(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
 
 
 class _Groups:
-    """Groups of objects, which `put` places on supports one by one."""
+    """Groups of objects, which `put` places on supports one by one; ``objects`` lists them all."""
 
     def __init__(self, rng: Generator) -> None:
         self.objects: list[PlacedObject] = []
@@ -154,9 +154,10 @@ class _Groups:
 
 
 def _draw_group(category: str, rng: Generator, gap: float, room: F8) -> list[_Place]:
-    """Draw a group of objects; return them layer by layer, or none if a single one is too large.
+    """Draw a block of equal objects, layer by layer, or a row of objects of different sizes.
 
-    ``gap`` is the distance between objects, ``room`` (3,) the maximum size of the group, metres.
+    ``gap`` is the distance between objects, ``room`` (3,) the maximum size of a block, metres. The
+    result is empty if not even one object fits.
     """
     piece = make_piece(category, rng)
     between = np.array([gap, gap, 0])

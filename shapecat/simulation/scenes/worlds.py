@@ -95,8 +95,8 @@ class World(Record):
     kind : name of the kind of scene.
     supports, objects : contents of the scene; mesh ids count the supports, then the objects.
     path : ``world_from_camera`` for each of the t images, with the camera's optical axes.
-    turns : (t,) rotation of all objects about the world's z axis in each frame, radians; None if
-        they do not rotate.
+    turns : (t,) rotation of all objects about the world's z axis in each frame, from their start
+        poses, radians; None if they do not rotate.
     motions : for each track of an object that moves, comes or goes, its translation (t, 3) from its
         start pose in each frame, metres, world frame; NaN in frames where the object is absent.
     """
@@ -126,7 +126,7 @@ class World(Record):
         return shifts is None or bool(np.isfinite(shifts[frame]).all())
 
     def geometry(self, frame: int) -> Geometry:
-        """Return the triangles in a frame, in world coordinates: supports first, then objects."""
+        """Return the triangles of the supports, then of the present objects, in the world frame."""
         moves = self.motions or self.turns is not None
         return self._gather(frame) if moves else self._still
 
