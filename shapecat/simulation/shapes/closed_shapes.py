@@ -70,7 +70,7 @@ def _tin(rng: Generator, r: float, h: float) -> F8:
 
 
 def _tube_can(rng: Generator, r: float, h: float) -> F8:
-    """Draw the profile (n, 2), radius and z, of a tube with radius ``r`` and height ``h``."""
+    """Draw the profile (n, 2), radius and z, of a tube-shaped can, radius ``r``, height ``h``."""
     lid, over = h * rng.uniform(0.03, 0.12), r * rng.uniform(0.98, 1.06)
     return np.array(
         [
@@ -149,9 +149,10 @@ def make_bottle(rng: Generator) -> Mesh:
 
 
 def _bottle_side(rng: Generator, family: str, body: float) -> F8:
-    """Return the profile (n, 2), radius and z, of a bottle's body, from its foot to its shoulder.
+    """Draw the profile (n, 2), radius and z, of a bottle's body, from its foot to its shoulder.
 
-    The bottle has height 1 and radius 1; its body ends at z = ``body``.
+    ``family`` is the kind of bottle, as in `make_bottle`. The bottle has height 1 and a radius of
+    about 1; its body ends at z = ``body``.
     """
     foot = rng.uniform(0.85, 0.98)
     waist = {"cleanser": rng.uniform(0.72, 1.0), "water": rng.uniform(0.84, 1.02)}.get(family, 1.0)
@@ -163,10 +164,10 @@ def _bottle_side(rng: Generator, family: str, body: float) -> F8:
 
 
 def _bottle(rng: Generator, side: F8, shoulder: float, neck: float, *, tip: bool) -> F8:
-    """Return the profile (n, 2), radius and z, of a bottle of height 1 and radius 1.
+    """Draw the profile (n, 2), radius and z, of a bottle of height 1, with its shoulder and cap.
 
-    ``side`` is the profile of its body, ``shoulder`` a height, ``neck`` a radius; ``tip`` narrows
-    the cap to a tip.
+    ``side`` is the profile of its body, from `_bottle_side`. ``shoulder`` is the height of the
+    shoulder above the body, ``neck`` the radius of the neck; with ``tip``, the cap is pointed.
     """
     start, width = side[-1, 1], side[-1, 0]
     t = np.linspace(0, 1, 9)[1:]
@@ -187,10 +188,10 @@ def _bottle(rng: Generator, side: F8, shoulder: float, neck: float, *, tip: bool
 
 
 def _flattened(mesh: Mesh, stretch: float, low: float, high: float, neck: float) -> Mesh:
-    """Make the body oval, but keep the neck round.
+    """Make the body of a bottle oval; keep the neck round, or at least no wider than the body.
 
-    ``stretch`` is the body's width along y divided by that along x. The body ends at z = ``low``,
-    and the neck, of relative radius ``neck``, begins at ``high``.
+    ``stretch`` is the body's width along y divided by that along x; from 1, nothing changes. The
+    body ends at z = ``low``; the neck begins at ``high`` and has ``neck`` times the body's radius.
     """
     if stretch >= 1:
         return mesh
@@ -215,7 +216,7 @@ def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
 
 
 def _pump(rng: Generator, radius: float, height: float) -> list[Mesh]:
-    """Return the stem and spout of a pump; the bottle has this height and a neck of this radius."""
+    """Return the stem and spout of a pump on a bottle; ``radius`` is that of the bottle's neck."""
     stem = rng.uniform(0.02, 0.045)
     thick = float(np.clip(0.35 * radius, 0.003, 0.006))
     z = height + stem

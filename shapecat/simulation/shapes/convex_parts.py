@@ -80,7 +80,10 @@ def _samples(mesh: Mesh) -> F8:
 
 
 def _blocks(points: F8) -> Iterator[F8]:
-    """Yield the corners (k, 3) of the points (n, 3) in each block of a grid, thickened."""
+    """Divide points (n, 3) into the blocks of a grid; yield the corners (k, 3) of a solid for each.
+
+    The solid of a block is the convex hull of its points, thickened.
+    """
     low = points.min(axis=0)
     side = np.maximum((points.max(axis=0) - low) / _BLOCKS, 4 * _SKIN_M)
     cell = np.minimum(((points - low) / side).astype(int), _BLOCKS - 1)
@@ -92,7 +95,7 @@ def _blocks(points: F8) -> Iterator[F8]:
 
 
 def _thickened(points: F8) -> F8:
-    """Return a part (n, 3) as points (m, 3), at least twice `_SKIN_M` thick in all directions."""
+    """Thicken points (n, 3) to at least twice `_SKIN_M` in all directions; return (m, 3)."""
     for _ in range(3):  # a plane, a line, or a point
         middle = points.mean(axis=0)
         normal = np.linalg.eigh((points - middle).T @ (points - middle))[1][:, 0]

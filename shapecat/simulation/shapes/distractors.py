@@ -17,7 +17,7 @@ __all__ = ["DISTRACTORS", "KINDS", "make_distractor"]
 DISTRACTORS: dict[str, Callable[[Generator], Mesh]] = {**KITCHEN, **TOOLS, **TOYS}
 """For each kind of object outside the categories, the function that makes a random one."""
 KINDS = tuple(DISTRACTORS)
-"""Their names, from which `make_distractor` draws by default."""
+"""Names of the `DISTRACTORS`, from which `make_distractor` draws by default."""
 
 
 def make_distractor(rng: Generator, kinds: Sequence[str] = KINDS) -> tuple[str, Mesh]:

@@ -142,7 +142,7 @@ def _fixture(rng: Generator) -> Mesh:
 
 
 def any_side(mesh: Mesh, rng: Generator) -> Mesh:
-    """Turn a mesh so that it stands on a side chosen at random."""
+    """Turn a mesh by 0, 90 or 180 degrees about x or y, at random, and stand it on z = 0."""
     about, degrees = str(rng.choice(["x", "y"])), float(rng.choice([0, 0, 90, 180]))
     return standing(placed(mesh, about=about, degrees=degrees))
 

@@ -123,8 +123,8 @@ def make_plate(rng: Generator) -> Mesh:
 def _wall(radii: ArrayLike, radius: float, height: float, *, power: float) -> F8:
     """Return the outer profile of a vessel from bottom to top: radius and z (m, 2), metres.
 
-    ``radii`` (k,) are relative to the largest one, which is ``radius``. They are evenly spaced in
-    height for a ``power`` of 1, and closer to the bottom for a larger one.
+    ``radii`` (k,), from bottom to top, are scaled so that the largest is ``radius``. They are
+    evenly spaced in height for a ``power`` of 1, and closer to the bottom for a larger one.
     """
     radii = np.asarray(radii, np.float64)
     heights = np.linspace(0, 1, len(radii)) ** power
@@ -141,8 +141,7 @@ def _wall(radii: ArrayLike, radius: float, height: float, *, power: float) -> F8
 def _foot(rng: Generator, chance: float, tallest: float) -> tuple[float, float]:
     """Draw a foot ring: its radius relative to the bottom's radius, and its height in metres.
 
-    With probability 1 - ``chance`` there is none, and the height is 0; else it is at most
-    ``tallest``.
+    There is one with probability ``chance``, at most ``tallest`` high; otherwise, the height is 0.
     """
     if rng.random() >= chance:
         return 1.0, 0.0
@@ -196,9 +195,10 @@ def _section(rng: Generator, *, oval: float, square: float, facets: float) -> di
 
 
 def _handle_shape(rng: Generator, diameter: float, height: float) -> tuple[F8, float, float]:
-    """Draw a handle for a cup of this size: its curve (k, 2), its radius and its flatness.
+    """Draw a handle for a cup of this size: its curve (k, 2), and radius and flatness for `tube`.
 
-    The columns of the curve are the distance from the wall and the height above its middle, metres.
+    The columns of the curve are the distance from the wall and the height above the middle of the
+    cup, metres.
     """
     tall = height * rng.uniform(0.25, 0.4)
     depth = diameter * rng.uniform(0.2, 0.42)
@@ -215,9 +215,10 @@ def _handle_shape(rng: Generator, diameter: float, height: float) -> tuple[F8, f
 
 
 def _handle(outer: F8, shape: tuple[F8, float, float], wall: float, side: float) -> Mesh:
-    """Return a handle at the angle ``side``, radians, of a wall ``wall`` metres thick.
+    """Return a handle at the angle ``side`` about z, radians, of a cup's wall.
 
-    ``outer`` (k, 2) is the radius and the height of its outside; ``shape`` is from `_handle_shape`.
+    ``outer`` is the outer profile of the wall, from `_wall`, and ``wall`` its thickness, metres;
+    ``shape`` is from `_handle_shape`.
     """
     curve, radius, flatness = shape
     height = curve[:, 1] + outer[-1, 1] / 2

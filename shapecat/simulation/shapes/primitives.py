@@ -102,7 +102,8 @@ def tube(
 def _across(path: F8, along: F8) -> F8:
     """Return unit vectors (k, 3) perpendicular to a path, with minimal rotation along it.
 
-    ``path`` (k, 3) are its points, ``along`` (k, 3) its unit directions.
+    For a path in a plane, they are normals of the plane. ``path`` (k, 3) are the points of the
+    path, ``along`` (k, 3) its unit directions.
     """
     spread = np.linalg.svd(path - path.mean(axis=0), full_matrices=False)[2]
     start = spread[-1] if abs(spread[-1] @ along[0]) < 0.9 else spread[0]
@@ -141,7 +142,8 @@ def rounded_box(size: ArrayLike, *, radius: float = 0.0, bulge: float = 0.0, fin
     Parameters
     ----------
     size : (3,) metres.
-    radius : radius of the edges, metres; limited to 0.45 times half the smallest size.
+    radius : radius of the edges, metres, limited to 0.225 times the smallest size; edges are sharp
+        if it is at most 0.2 mm.
     bulge : outward displacement of the middle of each side face, metres.
     fine : number of mesh cells along the flat part of a face.
     """
@@ -173,9 +175,9 @@ def rounded_box(size: ArrayLike, *, radius: float = 0.0, bulge: float = 0.0, fin
 
 
 def _box_lines(half: float, radius: float, fine: int) -> F8:
-    """Return the coordinates (n,) of the grid lines on a face, dense where the edges are round.
+    """Return the coordinates (n,) of the mesh lines on a face, dense where the edges are round.
 
-    They reach from -``half`` to ``half``; ``radius`` and ``fine`` are as for `rounded_box`.
+    They are ascending from -``half`` to ``half``; ``radius`` and ``fine`` are as for `rounded_box`.
     """
     flat = np.linspace(radius - half, half - radius, fine + 1)
     if radius <= 0:
