@@ -97,7 +97,7 @@ class Arrangement(NamedTuple):
 
 
 BARE_TABLE = moved(rounded_box(_TABLE_M), Pose(np.eye(3), np.array([0.0, 0.0, -_TABLE_M[2]])))
-"""A table top with nothing around it."""
+"""The furniture of a scene with nothing but a table: its top, with the upper face at z = 0."""
 _SETTLED: tuple[tuple[Callable[..., World], float, Arrangement], ...] = (
     (pile, 0.5, Arrangement([], (), (8.0, 90.0))),
     (bin_picking, 0.15, Arrangement([], (), (50.0, 90.0))),

@@ -50,7 +50,7 @@ The views of the test set with the most confident wrong labels. Colour shows the
 
 
 def markdown(title: str, head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a table as Markdown, with a heading; ``head`` is its header."""
+    """Return a table as Markdown: the heading ``title``, a header row ``head``, and the rows."""
     lines = [f"## {title}", "", f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
     lines += [f"| {' | '.join(map(str, row))} |" for row in rows]
     return "\n".join([*lines, ""])

@@ -24,7 +24,7 @@ _ROWS = 0.7
 
 
 class Growth(NamedTuple):
-    """Number of trees, leaves of each tree, and learning rate."""
+    """Number of trees, maximum number of leaves of each tree, and learning rate."""
 
     rounds: int
     leaves: int
@@ -73,9 +73,9 @@ def grow(features: F4, truth: Bool, growth: Growth, seed: int) -> BoostedTrees:
 
     Parameters
     ----------
-    features : (n, f).
-    truth : (n,) whether each row belongs to the positive class.
-    growth : number and size of the trees.
+    features : (n, f), one row per sample.
+    truth : (n,) whether each sample belongs to the positive class.
+    growth : number and size of the trees, and learning rate.
 
     Source: Friedman 2001.
     """

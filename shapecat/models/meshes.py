@@ -43,7 +43,8 @@ def mesh_views(
     Parameters
     ----------
     placements : number of rounds. In each, a mesh is placed 3 times upright and 2 times lying;
-        balls, bowls and plates are always upright. A mesh without such a stable pose gets any.
+        balls, bowls and plates are always upright. A mesh without such a stable pose gets any other
+        stable pose.
     cameras : number of images of each placement; their views share an instance name.
 
     Raises
@@ -87,10 +88,10 @@ def load_mesh(path: Path) -> Mesh:
 
 
 def uprighted(mesh: Mesh, category: str) -> Mesh:
-    """Turn a mesh upright; its category tells which of the six axis directions is up.
+    """Turn a mesh upright, and centre it on z = 0; its category tells which direction is up.
 
-    The axis of a can is the one along which its outline looks roundest. For the axis of a bottle,
-    its length counts, too, and the narrow end is up. A box or a ball keeps the axes of the file.
+    For a can, this is the axis along which the outline looks roundest. For a bottle, the length
+    along the axis counts, too, and the narrow end is up. Boxes and balls keep the axes of the file.
     Any other mesh, such as a cup, is turned so that its inside, seen from above, lies as deep as
     possible below its top.
     """

@@ -17,7 +17,7 @@ __all__ = ["split_necks"]
 SIDE, DIAGONAL = 3, 4
 """Chamfer distances from a cell to its neighbours, in thirds of a cell."""
 NECK = 1.7
-"""A surface is split at a neck if both of its sides are at least this many times as wide."""
+"""A region is split at a neck if the parts on both sides are at least this many times as wide."""
 
 
 @kernel
@@ -75,9 +75,9 @@ def split_necks(graph: SurfaceGraph, labels: I4, n: int) -> int:
 
 @kernel
 def _distances(links: U1, spans: I4, labels: I4) -> tuple[I4, int]:
-    """Return the distance of labelled cells from the border of their label, and their number.
+    """Return the distances of cells from the border of their label, and how many have a label.
 
-    The distances (rows, columns) are in thirds of a cell, and uninitialised elsewhere.
+    The distances (rows, columns) are in thirds of a cell, and uninitialised outside the labels.
     ``labels`` are (rows, columns); ``links`` and ``spans`` are as in `SurfaceGraph`.
     """
     (rows, columns), count = labels.shape, 0
@@ -157,8 +157,9 @@ def _number(cells: I4, basin: I4, parent: I4, size: I4, last: int, labels: I4, n
     """Relabel the cells by basin, in place; return the new number of labels.
 
     ``cells`` (count,) are flat indices; ``basin`` is that of each cell, flattened like ``labels``.
-    The basins 1..last are joined as ``parent`` says; ``size`` is their number of cells. The largest
-    basin of each label 1..n keeps the label; the others get new ones, up to `max_segments`.
+    ``parent`` (k,) joins the basins 1..last; ``size`` (k,) is their number of cells. The largest
+    basin of each label 1..n keeps the label; the others get new ones, or keep it, too, when there
+    are `max_segments`.
     """
     label, largest = unset(last + 1, np.int16), np.zeros(n + 1, np.int32)
     for p in cells:

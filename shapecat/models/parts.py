@@ -151,7 +151,7 @@ def _pairs(
     ----------
     split_seeds : as for `oversegment`.
     pixel_labels : (h, w) pixel labels of the scene.
-    object_labels : (k,) labels of objects.
+    object_labels : (k,) pixel labels of objects.
     """
     model = model_planes(grid, None, Task(_SETTINGS, rng))
     if model is None:
@@ -179,12 +179,12 @@ def _pairs(
 
 
 def count_labels(pixel_labels: U1, labels: I4, grid: DepthGrid) -> I4:
-    """Return how many cells of each segment have each pixel label, (segments, labels).
+    """Return how many cells of each segment have each pixel label: (n, l), both counted from 0.
 
     Parameters
     ----------
     pixel_labels : (h, w) pixel labels at full resolution.
-    labels : (rows, columns) segment of each cell of the grid.
+    labels : (rows, columns) segment of each cell of the grid, 0 for none.
     """
     middle, (rows, columns) = grid.factor // 2, labels.shape
     sampled = pixel_labels[middle :: grid.factor, middle :: grid.factor][:rows, :columns]

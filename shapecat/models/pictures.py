@@ -18,7 +18,7 @@ _COLUMNS = 6
 
 
 class Mistake(NamedTuple):
-    """A view, its wrong ``predicted`` label, and the confidence in this label."""
+    """A simulated view, its voxels ``view``, its wrong ``predicted`` label, and the confidence."""
 
     simulated: SimulatedView
     view: View

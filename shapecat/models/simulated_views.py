@@ -72,7 +72,7 @@ class SimulatedView(NamedTuple):
     source : how the view was segmented: ``truth``, ``detected`` or ``fragment``; or ``background``,
         for a thin detection that shows no object and has the label ``unknown``.
     visible : number of the object's depth pixels, divided by its number of pixels if nothing
-        occluded it.
+        occluded it; 1 for background.
     overlap : IoU of the detection and the object's depth pixels, for a fragment before it was cut;
         1 for views that are not from a detection, and for background.
     sensor : name of the sensor.
@@ -198,7 +198,10 @@ def _views_of(
     instance: str,
     rng: np.random.Generator,
 ) -> list[SimulatedView]:
-    """Return a view of object ``k``, segmented by truth or detection, and sometimes a fragment."""
+    """Return a view of object ``k``, segmented by truth or detection, and sometimes a fragment.
+
+    Views with too few points for a surface are left out.
+    """
     detected = _segment_by_detection(image, scene, k)
     if detected is not None and rng.random() < _DETECTED_SHARE:
         (view, overlap), source = detected, "detected"
@@ -253,7 +256,7 @@ def _view_of(image: RenderedView, scene: Scene, candidate: Candidate) -> View:
 def _segment_by_truth(
     image: RenderedView, k: int, item: ArrangedObject, rng: np.random.Generator
 ) -> View:
-    """Return the true points of object ``k`` in its level frame.
+    """Return the true points of object ``k`` in its level frame, without label and instance.
 
     The level frame has random errors of about half a degree and 2 mm, like one from detection.
     """

@@ -140,7 +140,8 @@ class Samples(NamedTuple):
     ----------
     features : (n,) records of `OBJECT_FEATURES`.
     objects : (n,) whether each segment shows an object.
-    borders : for each frame, the border lengths of its segments, from `measure_borders`.
+    borders : for each frame, the border lengths (4, r, r) of its r segments, from
+        `measure_borders`.
     """
 
     features: Records
@@ -223,7 +224,7 @@ def _collect(series: Series) -> Samples:
 def _views(series: Series, seed: int) -> Iterator[Samples]:
     """Yield the segments of each view of one scene.
 
-    Making the scene takes ten times as long as a view.
+    A scene has several views, since making it takes ten times as long as a view.
     """
     rng = np.random.default_rng(seed)
     world = make_scene(series.kind, rng, frames=1)
@@ -246,7 +247,8 @@ def _with_arms(
 ) -> World:
     """Add arms to a world: those of the robot that carries the camera, or of a person.
 
-    ``arms`` is as in `Series`; ``view`` and ``intrinsics`` are those of the camera.
+    ``arms`` is as in `Series`; ``none`` changes nothing. ``view`` is as for `render_frame`;
+    ``intrinsics`` are those of the camera.
     """
     if arms == "none":
         return world
@@ -265,7 +267,7 @@ def label_objects(frame: Frame, pixel_labels: U1, object_labels: I4) -> Iterator
     Parameters
     ----------
     pixel_labels : (h, w) pixel labels of the scene, 0 where unknown.
-    object_labels : (k,) labels of objects, in ascending order.
+    object_labels : (k,) pixel labels of objects.
     """
     settings = DetectionSettings()
     if frame.depth is None or frame.camera is None:

@@ -31,7 +31,8 @@ def random_viewpoint(
 
     Parameters
     ----------
-    distance_m : minimum and maximum distance from a point among the objects, metres.
+    distance_m : minimum and maximum distance from a point among the objects, metres; larger if the
+        near limit of the sensor requires it.
     """
     places = [item.pose.translation for item in world.objects]
     if not places:
@@ -51,7 +52,10 @@ def random_viewpoint(
 
 
 def move_to_floor(world: World) -> World:
-    """Remove the table, and the arms and the screen on it; put the objects on the floor."""
+    """Remove the table, and the arms and the screen on it; put the objects on the floor.
+
+    The world must have a support named ``table``.
+    """
     table = next(support for support in world.supports if support.name == "table")
     down = np.array([0.0, 0.0, -table.height])
     objects = (
