@@ -2,7 +2,7 @@
 
 `features` standardises a descriptor. `forest` finds the leaf of each tree that these features
 reach. `categorizer` turns the values of the leaves into a calibrated posterior and a novelty. These
-modules predict; `boosted` and `training` train.
+modules predict; `training` trains a model, and `incremental` adds categories to it.
 """
 
 from shapecat.learning.categorizer import Categorizer, Prediction

@@ -15,7 +15,7 @@ __all__ = ["BoostedEnsemble", "grow_ensemble"]
 
 _L2 = 2.0
 _MIN_HESSIAN = 1.0
-"""Values of `TreeSettings`."""
+"""L2 regularisation and minimum sum of second derivatives, as in `TreeSettings`."""
 _COLUMNS, _ROWS = 0.08, 0.5
 """Fractions of the features and of the views that are drawn at random for each tree."""
 _FEWEST_COLUMNS = 10
@@ -89,7 +89,7 @@ def _boost(
 ) -> list[Tree]:
     """Grow one tree per category in each round; return them round by round.
 
-    The leaf values of all trees are added to ``scores`` (k, n), the logits of the n views.
+    ``scores`` (k, n) are the initial logits of the n views; the leaf values are added in place.
     ``labels``, ``rounds`` and ``jobs`` are as for `grow_ensemble`.
     """
     truth = labels == np.arange(len(scores))[:, None]
@@ -114,7 +114,7 @@ def _boost(
 
 
 def _draw(bins: Bins, rng: np.random.Generator) -> tuple[I4, I4]:
-    """Draw the columns and the rows of one tree; return their indices."""
+    """Draw the features and the views to grow one tree from; return their indices, ascending."""
     features, views = bins.binned.shape
     width = max(round(_COLUMNS * features), min(features, _FEWEST_COLUMNS))
     height = max(round(_ROWS * views), min(views, _FEWEST_ROWS))
@@ -123,7 +123,10 @@ def _draw(bins: Bins, rng: np.random.Generator) -> tuple[I4, I4]:
 
 
 def _join(trees: Sequence[Tree], categories: int) -> tuple[FlatForest, F4]:
-    """Return the trees as one forest, and the values (l, categories) of its l leaves."""
+    """Return the trees as one forest, and the values (l, categories) of its l leaves.
+
+    ``trees`` are from `_boost`. A leaf has a value for the category of its tree only, else 0.
+    """
     (roots, feature, threshold, left), value = joined(trees)
     leaf = left == 0
     forest = FlatForest(roots, feature, np.where(leaf, 0, threshold), left)

@@ -175,9 +175,10 @@ def _grow(
 
 @kernel(inner=True)
 def _collect(binned: U1, columns: I4, rows: I4, gradient: F4, hessian: F4, sums: F4) -> None:
-    """Add the derivatives of the views in ``rows`` to ``sums`` (columns, BINS, 2), bin by bin.
+    """Add the derivatives of the views in ``rows`` to ``sums`` (c, BINS, 2), bin by bin.
 
-    The last axis is gradient, hessian; the parameters are as for `_grow`.
+    The first axis is that of the c features in ``columns``, the last one is gradient, hessian. The
+    other parameters are as for `_grow`.
     """
     g, h = gradient[rows], hessian[rows]
     for c in range(columns.size):
@@ -223,10 +224,11 @@ def _best_cut(sums: F4, l2: float, min_hessian: float, best: F8) -> float:
 
 @kernel(inline=True)
 def _divide(bins: U1, rows: I4, first: int, last: int, cut: int, spare: I4) -> int:
-    """Move the views with bins <= ``cut`` to the front of rows[first:last], keeping their order.
+    """Move the views with bins <= ``cut`` to the front of rows[first:last].
 
-    ``bins`` (n,) are the bins of all views in one feature. Returns the index in ``rows``
-    where the other views begin; ``spare`` is work space of the size of ``rows``.
+    Both these and the other views keep their order. ``bins`` (n,) are the bins of all views in one
+    feature. Returns the index in ``rows`` where the other views begin; ``spare`` is work space of
+    the size of ``rows``.
     """
     low, high = first, 0
     for i in range(first, last):

@@ -64,7 +64,7 @@ class FlatForest(Record):
         return Trees(self.roots, self.feature, self.threshold, left), self.leaf_id
 
     def apply(self, features: F4) -> I4:
-        """Return the ids (n, t) of the leaves that features (n, f) reach in each tree.
+        """Return the ids (v, t) of the leaves that views with features (v, f) reach in each tree.
 
         Raises
         ------

@@ -15,7 +15,7 @@ def choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
 
     Parameters
     ----------
-    codes : (n,) category of each view.
+    codes : (n,) index of the true logit of each view.
     """
     order = rng.permutation(len(codes))
     rank = np.zeros(len(order), np.int64)

@@ -38,8 +38,8 @@ def save_model(path: Path, categorizer: Categorizer) -> None:
 
     Raises
     ------
-    OutputError : the file cannot be written, or exists and is not a model, or the model is larger
-        than `load_model` reads.
+    OutputError : the file cannot be written, or is neither empty nor a model, or the model is
+        larger than `load_model` reads.
     """
     require_model_path(path)
     parts = parts_of(categorizer)
@@ -153,7 +153,12 @@ def _parse(content: bytes) -> Categorizer:
 
 
 def _read_members(content: bytes) -> dict[str, bytes]:
-    """Unpack the members of an archive, without trusting the sizes that it states."""
+    """Unpack the members of an archive by name, without trusting the sizes that it states.
+
+    Raises
+    ------
+    _NotAModelError : the archive is damaged or too large.
+    """
     if len(content) > _LARGEST_FILE:
         msg = f"it is larger than {_LARGEST_FILE >> 20} MB"
         raise _NotAModelError(msg)
@@ -183,7 +188,12 @@ def _unpack(archive: zipfile.ZipFile) -> dict[str, bytes]:
 
 
 def _parse_array(data: bytes) -> np.ndarray:
-    """Read an array in .npy format; allocate no more memory than the data need."""
+    """Read an array in .npy format; allocate no more memory than the data need.
+
+    Raises
+    ------
+    _NotAModelError, ValueError : the data are damaged.
+    """
     stream = io.BytesIO(data)
     if np.lib.format.read_magic(stream) != (1, 0):
         msg = "an array has an unknown version"

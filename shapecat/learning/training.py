@@ -34,7 +34,7 @@ class LearningSettings:
     rate: float = 0.06
     """Learning rate of the boosting."""
     known_views: int = KNOWN_VIEWS
-    """Number of views stored in the model as negative examples for new categories."""
+    """Maximum number of views stored in the model as negative examples for new categories."""
     rejected: float = 0.05
     """Fraction of held-out views of known categories that the novelty threshold rejects."""
     jobs: int = 1
