@@ -19,7 +19,10 @@ __all__ = ["completed", "label_file", "require_replaceable", "written_paths"]
 
 
 def written_paths(out: Path, format: str) -> list[Path]:  # noqa: A002  the word users know
-    """Return the paths that `simulate` may write: recording, truth, labels, colour labels."""
+    """Return the paths that `simulate` may write: recording, truth, labels, colour labels.
+
+    The recording is ``out``, with the suffix of the format if it has none.
+    """
     suffix = CONTAINERS[format].suffix
     out = out if out.suffix or not suffix else out.with_name(out.name + suffix)
     ends = ("truth.json", "labels.npz", "color_labels.npz")

@@ -57,9 +57,10 @@ def render_colour(world: World, frame: int) -> tuple[U1, U1]:
 
 @cache
 def _distortion_map() -> tuple[Camera, I4, I4]:
-    """Return a finer pinhole camera, and which of its pixels each pixel of the lens camera shows.
+    """Return an oversampled pinhole camera, and the rows and columns of its image to sample.
 
-    The pixels are two arrays (h, w): rows and columns.
+    Each pixel of the distorted image shows a pixel of the pinhole image; two arrays (h, w) give the
+    row and the column of that pixel.
     """
     camera = COLOUR_LENS.pinhole
     rays = np.asarray(undistorted_rays(camera, COLOUR_LENS.model, COLOUR_LENS.coefficients))

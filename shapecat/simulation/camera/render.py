@@ -14,8 +14,8 @@ from shapecat.types import Camera, Pose
 __all__ = ["Geometry", "Image", "cropped", "geometry", "pixels_if_unoccluded", "render"]
 
 NEAR_M = 0.02
-"""A triangle is skipped if all its corners have at most this depth. If some have, all pixels of the
-image are tested, not only those around the triangle."""
+"""Minimum depth: a triangle is skipped if no corner is farther away. If only some corners are, all
+pixels of the image are tested, not only those around the triangle."""
 
 
 class Geometry(Record):

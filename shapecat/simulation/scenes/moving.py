@@ -19,7 +19,7 @@ _ANYWHERE = np.array([0.6, 0.3])
 """Half the size in x and y of an area that covers any strip; `Layout.put` draws positions in it and
 rejects those outside the strip."""
 _MOVERS = ("ball", "can", "cup", "bottle", "box")
-"""Categories of moving objects, most of which are narrow enough for a lane."""
+"""Categories of moving objects, most of which are narrow enough for the strip they slide in."""
 
 
 def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
@@ -119,12 +119,12 @@ def _strip(support: Support, x: tuple[float, float], y: tuple[float, float]) -> 
 
 
 def _shifted(along: F8) -> F8:
-    """Return a motion in x, as in `World`; ``along`` (frames,) are displacements, metres."""
+    """Return the motion (frames, 3) by ``along`` (frames,) in x, as in `World`; metres."""
     return np.round(np.outer(along, [1.0, 0, 0]), 6)
 
 
 def _pushed(start: F8, t: F8) -> F8:
-    """Return the motion of an object that is pushed 0.4 m along x, at 0.2 m/s, from t = 0.
+    """Return the motion (frames, 3) of an object pushed 0.4 m along x, at 0.2 m/s, from t = 0.
 
     ``start`` (3,) is its position, from which it moves towards x = 0; ``t`` (frames,) is the time
     of each frame, seconds.
@@ -134,7 +134,7 @@ def _pushed(start: F8, t: F8) -> F8:
 
 
 def _carried(displacement: F8, t: F8) -> F8:
-    """Return the motion of an object that is carried by ``displacement`` (3,), metres.
+    """Return the motion (frames, 3) of an object that is carried by ``displacement`` (3,), metres.
 
     It moves at 0.5 m/s from t = 0, and is lifted by up to 15 cm; ``t`` is as for `_pushed`.
     """

@@ -54,7 +54,7 @@ def _fruit(rng: Generator, diameter: float) -> Mesh:
 
 
 def _ribbed(mesh: Mesh, height: float) -> Mesh:
-    """Add five ribs around the z axis; their height is a fraction of the radius."""
+    """Add five ribs around the z axis, as high as ``height`` times the radius."""
     points = np.array(mesh.vertices, np.float64)
     ribs = np.cos(5 * np.arctan2(points[:, 1], points[:, 0]))
     points[:, :2] *= (1 + height * ribs)[:, None]

@@ -12,11 +12,11 @@ from shapecat.simulation.shapes.mesh import Mesh, join, standing
 __all__ = ["Points", "extrude", "lathe", "rounded_box", "smooth_path", "tube"]
 
 Points: TypeAlias = F8 | Sequence[Sequence[float]]
-"""Rows of coordinates, metres."""
+"""Coordinates (n, d), one point per row."""
 
 
 def _grid(rows: int, columns: int, *, closed: bool) -> I4:
-    """Return the triangles (m, 3) of a grid of vertices; if ``closed``, each row is a ring."""
+    """Return triangles (m, 3) of a grid of vertices, row by row; if ``closed``, rows are rings."""
     row = np.arange(rows - 1)[:, None] * columns
     column = np.arange(columns if closed else columns - 1)[None]
     after = (column + 1) % columns

@@ -59,7 +59,7 @@ def stable_poses(mesh: Mesh) -> tuple[StablePose, ...]:
 
 
 def choose_stable_pose(mesh: Mesh, name: str, rng: Generator) -> StablePose | None:
-    """Draw a random stable pose of a mesh with this name; None if there is none."""
+    """Draw one of the stable poses of a mesh that are called ``name``; None if it has none."""
     fitting = [stable for stable in stable_poses(mesh) if stable.name == name]
     return fitting[int(rng.integers(len(fitting)))] if fitting else None
 
