@@ -201,11 +201,11 @@ def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, l2: float, steps: i
 def _shift(
     inputs: _Inputs, old: F8, truth: I4, learned: F8, l2: float, rng: np.random.Generator
 ) -> float:
-    """Return the constant to add to the new logits: the largest that does little harm, at least 0.
+    """Return the constant to add to the new logits, at least 0.
 
-    With it, the new categories take over at most a fraction `_LOST` of the views that the old
-    logits categorize correctly. The new logits of a view come from a fit without the view. The
-    parameters are as for `_fit_new`; ``learned`` are the weights that it returned for all views.
+    It is the largest with which the new categories take over at most a fraction `_LOST` of the
+    views that the old logits categorize correctly. The new logits of a view come from a fit without
+    the view. The parameters are as for `_fit_new`; ``learned`` are its weights for all views.
     """
     fold = rng.permutation(len(truth)) % _FOLDS
     new = np.zeros((len(truth), learned.shape[1]))

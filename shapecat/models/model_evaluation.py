@@ -108,7 +108,10 @@ def _test_views() -> list[SimulatedView]:
 
 
 def _parts(views: SimulatedViews, model: Categorizer) -> list[tuple[str, Report]]:
-    """Return the name and report of each subset of the views; subsets differ in difficulty."""
+    """Return names and reports of subsets of the views, such as upright or badly segmented ones.
+
+    The subsets overlap; empty ones are left out.
+    """
     background = views.source == "background"
     whole = (views.source != "fragment") & ~background
     clear = clear_views(views)

@@ -22,8 +22,8 @@ _REJECTED = 0.14
 """Fraction of the partial views of known categories that the novelty threshold rejects. Real
 objects are often partly hidden, and a partial view is more novel than a whole one."""
 _TREES: dict[str, Any] = {"rounds": 320, "leaves": 40, "rate": 0.09}
-"""With so many views, the trees can be larger than by default. There are fewer of them, so that
-training takes the same time."""
+"""Settings of the boosted trees: larger than by default, since there are so many views, but fewer,
+so that training takes the same time."""
 
 
 @click.command()
