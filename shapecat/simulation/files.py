@@ -33,8 +33,8 @@ def written_paths(out: Path, format: str) -> list[Path]:  # noqa: A002  the word
 def completed(paths: Sequence[Path], *, obsolete: Sequence[Path]) -> Iterator[list[Path]]:
     """Provide hidden paths; if the block succeeds, move the files written there to ``paths``.
 
-    The first path is that of the recording. Then delete the ``obsolete`` files, which an earlier
-    recording may have left.
+    The ``obsolete`` files, which an earlier recording may have left, are then deleted. The first
+    path is that of the recording.
 
     Raises
     ------

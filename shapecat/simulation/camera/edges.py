@@ -26,8 +26,8 @@ MARGIN_DISCONTINUITY = 0.07
 def displace_edges(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4]:
     """Displace the depth edges of a rendered image at random, as a depth camera does.
 
-    If the sensor has a stereo matching window, it also rounds the corners of outlines. Returns the
-    inverse depth (1/m), mesh ids and cosines, all (h, w); the image does not change.
+    A stereo matching window also rounds the corners of outlines. Returns the inverse depth (1/m),
+    mesh ids and cosines, all (h, w); the image does not change.
 
     Source: Barron and Malik 2013.
     """
@@ -156,8 +156,9 @@ def drop_margins(inverse: F8, width: int, lost: Bool) -> None:
 def _blend(inverse: F8, radius: int, out: F8) -> None:
     """Write inverse depth (h, w) to ``out``, averaged over windows at depth edges, else unchanged.
 
-    The window of a pixel extends ``radius`` pixels to each side; in its middle row, it must contain
-    an edge. Pixels without depth are not averaged, and windows must lie within the image.
+    A window extends ``radius`` pixels to each side. A pixel gets the average if there is an edge in
+    the middle row of its window, and the whole window is in the image. Pixels without depth do not
+    count.
     """
     height, width = inverse.shape
     for v in range(height):

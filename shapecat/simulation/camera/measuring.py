@@ -59,7 +59,7 @@ def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
 
 
 def _inverse_depth_error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
-    """Draw the error of the inverse depth before quantization; both are (h, w), 1/m."""
+    """Draw the error (h, w) of ``inverse`` (h, w), inverse depth before quantization; 1/m."""
     error = np.zeros(inverse.shape, np.float32)
     if sensor.noise > 0:
         error += noise(

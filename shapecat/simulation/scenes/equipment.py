@@ -46,7 +46,7 @@ def make_arm(rng: Generator, base: F8, tip: F8) -> list[Mesh]:
 
 
 def make_own_arms(rng: Generator, camera: Pose, height: float) -> list[Mesh]:
-    """Return the parts of the arms of the robot that carries the camera, one or two.
+    """Return the parts of one or two arms of the robot that carries the camera.
 
     The arms enter the image from its border.
 

@@ -190,5 +190,5 @@ def _board(name: str, label: int, size: Sequence[float], place: Sequence[float])
 
 
 def as_equipment(name: str, meshes: Sequence[Mesh]) -> list[Support]:
-    """Return meshes in the world frame as supports ``name_0``, ``name_1``... without objects."""
+    """Return meshes in the world frame as supports ``name_0``, ``name_1``... that hold nothing."""
     return [Support(f"{name}_{k}", EQUIPMENT, mesh) for k, mesh in enumerate(meshes)]

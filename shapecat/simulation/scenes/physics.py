@@ -165,7 +165,7 @@ def _pose(data: Any, k: int) -> Pose:
 
 
 def _settled_poses(mujoco: Any, model: Any, data: Any, count: int) -> list[SettledPose]:
-    """Return the settled pose of each object, supported by what pushes it upwards the most."""
+    """Return the settled pose of each object; the body that pushes it up most is its support."""
     model.opt.enableflags = 0  # sleeping bodies have no contacts
     mujoco.mj_forward(model, data)
     upward_force = np.zeros((count, count + 1))  # the last column: obstacles

@@ -190,8 +190,8 @@ def _bottle(rng: Generator, side: F8, shoulder: float, neck: float, *, tip: bool
 def _flattened(mesh: Mesh, stretch: float, low: float, high: float, neck: float) -> Mesh:
     """Make the body of a bottle oval; keep the neck round, or at least no wider than the body.
 
-    ``stretch`` is the body's width along y divided by that along x; from 1, nothing changes. The
-    body ends at z = ``low``; the neck begins at ``high`` and has ``neck`` times the body's radius.
+    ``stretch`` is the body's width along y divided by that along x; 1 changes nothing. The body
+    ends at z = ``low``; the neck begins at ``high`` and has ``neck`` times the body's radius.
     """
     if stretch >= 1:
         return mesh
