@@ -88,7 +88,7 @@ def load_mesh(path: Path) -> Mesh:
 
 
 def uprighted(mesh: Mesh, category: str) -> Mesh:
-    """Turn a mesh upright, and centre it on z = 0; its category tells which direction is up.
+    """Turn a mesh upright and stand it on z = 0; its category tells which direction is up.
 
     For a can, this is the axis along which the outline looks roundest. For a bottle, the length
     along the axis counts, too, and the narrow end is up. Boxes and balls keep the axes of the file.

@@ -75,7 +75,7 @@ def split_necks(graph: SurfaceGraph, labels: I4, n: int) -> int:
 
 @kernel
 def _distances(links: U1, spans: I4, labels: I4) -> tuple[I4, int]:
-    """Return the distances of cells from the border of their label, and how many have a label.
+    """Return the distance of labelled cells from the border of their label, and the cell count.
 
     The distances (rows, columns) are in thirds of a cell, and uninitialised outside the labels.
     ``labels`` are (rows, columns); ``links`` and ``spans`` are as in `SurfaceGraph`.
@@ -158,8 +158,8 @@ def _number(cells: I4, basin: I4, parent: I4, size: I4, last: int, labels: I4, n
 
     ``cells`` (count,) are flat indices; ``basin`` is that of each cell, flattened like ``labels``.
     ``parent`` (k,) joins the basins 1..last; ``size`` (k,) is their number of cells. The largest
-    basin of each label 1..n keeps the label; the others get new ones, or keep it, too, when there
-    are `max_segments`.
+    basin of each label 1..n keeps the label; the others get new ones, until there are
+    `max_segments` labels, and then keep theirs, too.
     """
     label, largest = unset(last + 1, np.int16), np.zeros(n + 1, np.int32)
     for p in cells:

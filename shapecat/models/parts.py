@@ -179,7 +179,9 @@ def _pairs(
 
 
 def count_labels(pixel_labels: U1, labels: I4, grid: DepthGrid) -> I4:
-    """Return how many cells of each segment have each pixel label: (n, l), both counted from 0.
+    """Return how many cells of each segment have each pixel label.
+
+    The result (n, l) is indexed by segment, then by pixel label.
 
     Parameters
     ----------

@@ -76,7 +76,7 @@ def _best_overlap(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int 
 def _nearest(scene: Scene, item: dict[str, Any]) -> int | None:
     """Return the index of the candidate nearest to an object; None if all are too far away.
 
-    ``item`` is the truth of the object. From half of its largest extent, a candidate is too far.
+    ``item`` is the truth of the object. Candidates must be nearer than half of its largest extent.
     """
     place = np.array(item["centroid_m"])
     gaps = [float(np.linalg.norm(c.box.center - place)) for c in scene.candidates]

@@ -52,7 +52,7 @@ _THIN_M = 0.03
 category: a cupboard is a box."""
 _HEIGHT = DESCRIPTOR_NAMES.index("metric.height")
 _DETECTED_SHARE = 0.75
-"""Fraction of the detected objects that are segmented by detection; the others are by truth."""
+"""Fraction of the detected objects that are segmented by detection; others are by ground truth."""
 _FRAGMENTS = 0.3
 """Fraction of the views from which a partial view is cut in addition."""
 _SETTINGS = Settings()
