@@ -1,1 +1,1 @@
-"""The phases that perceive the frames of a recording, and their reports."""
+"""The phases that perceive the frames of a recording, and warnings about their results."""

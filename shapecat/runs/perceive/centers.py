@@ -38,7 +38,10 @@ class Centers(NamedTuple):
 
 
 def centers_of(frames: pa.Table, detections: pa.Table) -> Iterator[tuple[Key, Centers]]:
-    """Yield each frame in a part of the tables, and the centres of its objects."""
+    """Yield each frame and the centres of its objects, of which there may be none.
+
+    ``frames`` and ``detections`` are parts of the tables for the same frames.
+    """
     rows = frame_rows(detections)
     in_sensor, in_fixed = (numbers_or_nan(detections[name]) for name in ("center", "center_fixed"))
     for key, stamp in zip(keys_of(frames), numbers(frames["stamp_ns"]).tolist(), strict=True):
@@ -47,6 +50,9 @@ def centers_of(frames: pa.Table, detections: pa.Table) -> Iterator[tuple[Key, Ce
 
 
 def moved_m(previous: F8, current: F8) -> float:
-    """Return the median distance of objects (n, 3) to the nearest previous ones (m, 3), metres."""
+    """Return the median distance from ``current`` centres to the nearest previous one, metres.
+
+    ``current`` (n, 3) and ``previous`` (m, 3) are not empty; the result is NaN if they are NaN.
+    """
     distances = np.linalg.norm(current[:, None] - previous, axis=2)
     return float(np.median(distances.min(axis=1)))

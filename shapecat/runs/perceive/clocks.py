@@ -44,17 +44,19 @@ def explain_clocks(folder: Path) -> Iterator[str]:
 def explain_transform_clocks(
     folder: Path, transforms: TransformBuffer, fixed_frame: str, frame_ids: Mapping[str, str]
 ) -> Iterator[str]:
-    """Yield a warning for each sensor whose clock is not that of the transforms that move it.
+    """Yield a warning for each sensor whose clock differs from that of its moving transforms.
 
     The delays of images and transforms are compared at the same log times, since a simulation may
-    be slower than the recorder's clock. If several frames move the sensor, the one with the most
-    similar delay counts: localization may stamp its transforms with a time in the future.
+    be slower than the recorder's clock. If several transforms move the sensor, the most similar
+    delay counts: localization may stamp its transforms with a time in the future. Topics and
+    transforms without stamps are not compared.
 
     Parameters
     ----------
     folder : folder with the table of frames.
     transforms : the transforms, after all frames were looked up.
-    frame_ids : the frame of each topic's data.
+    fixed_frame : the frame in which the sensors move.
+    frame_ids : the coordinate frame of each topic's data.
     """
     times = ["stamp_ns", "log_time_ns"]
     logs = read_by_topic(

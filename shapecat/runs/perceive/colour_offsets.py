@@ -45,7 +45,10 @@ class _Stream:
     compared: Centers | None = None
 
     def compare(self, centers: Centers) -> None:
-        """Measure the motion of the objects in a frame since the last compared one."""
+        """Add the speed of the objects since the last compared frame to ``speeds``.
+
+        Frames are compared if they have objects, and `APART_S` to `GAP_S` are between them.
+        """
         if not len(centers.sensor):
             return
         previous = centers if self.compared is None else self.compared

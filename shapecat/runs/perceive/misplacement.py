@@ -23,9 +23,9 @@ _WORSE = 1.5
 """Poses are worse than none if objects move more than this many times as far in the fixed frame as
 relative to the camera."""
 _MIN_MOTIONS = 5
-"""Minimum number of comparisons on which a warning is based."""
+"""Minimum number of comparisons for a warning."""
 _WORSE_SHARE = 0.7
-"""Minimum fraction of the comparisons in which poses are worse than none."""
+"""A warning needs poses that are worse than none in more than this fraction of comparisons."""
 
 
 def explain_misplacement(folder: Path, fixed_frame: str) -> Iterator[str]:

@@ -16,7 +16,7 @@ from shapecat.types import Frame
 __all__ = ["explain_missing_planes"]
 
 _NO_ROOM_M = 10.0
-"""If the median depth is larger, its unit is wrong rather than the range, as rooms are smaller."""
+"""A larger median depth is blamed on the unit, since rooms are smaller; else on the range."""
 
 _OBJECT_M = 0.6
 """If all points of a frame are within this length, they may be a single object."""
@@ -102,7 +102,10 @@ def _distances(frame: Frame) -> F4:
 
 
 def _extent_m(frame: Frame) -> float:
-    """Return the longest side of the box around all points, along the sensor's axes, metres."""
+    """Return the longest side of the box around all points, along the sensor's axes, metres.
+
+    It is 0 without valid points.
+    """
     valid = frame.finite_xyz()
     with np.errstate(over="ignore"):
         return float(np.ptp(valid, axis=0).max()) if len(valid) else 0.0

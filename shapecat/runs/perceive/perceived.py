@@ -30,7 +30,7 @@ from shapecat.types import Perception, Pose
 __all__ = ["FrameRow", "PerceptionTables"]
 
 _SEGMENT_S = 2.0
-"""A segment is written if this time has passed since the last one, to limit the cost of a kill."""
+"""A segment is written if this time has passed since the last one, so that a kill loses little."""
 _SEGMENT_FRAMES = 2 * GROUP_FRAMES
 """A segment is written if at least this many frames are waiting."""
 
@@ -112,7 +112,10 @@ class PerceptionTables:
         self._join()
 
     def write(self, perceptions: Sequence[Perception], rows: Sequence[FrameRow]) -> None:
-        """Append a block of frames, which are never split between segments."""
+        """Append a block of frames; a segment holds whole blocks.
+
+        ``rows[k]`` belongs to ``perceptions[k]``.
+        """
         self._pending.extend(zip(perceptions, rows, strict=True))
         late = time.monotonic() - self._flushed > _SEGMENT_S
         if late or len(self._pending) >= _SEGMENT_FRAMES:
@@ -170,9 +173,9 @@ def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]], *, again: bool) 
 
 
 def _pose_columns(name: str, poses: Sequence[Pose | None]) -> dict[str, Any]:
-    """Return the columns of translations (3,) and rotations (9,), row by row; None if unknown.
+    """Return the columns of translations (3,) and rotations (9,), None where the pose is unknown.
 
-    Their names begin with ``name``.
+    Their names begin with ``name``. Rotation matrices are flattened row by row.
     """
     return {
         f"{name}_translation": [pose and pose.translation for pose in poses],

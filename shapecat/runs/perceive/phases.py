@@ -150,7 +150,8 @@ def _perceiving(
 
     Parameters
     ----------
-    phase, total : name of the phase and number of frames, for progress; None if unknown.
+    phase : name of the phase, for progress.
+    total : number of frames; None if unknown.
     again : whether the frames are perceived a second time (`revise`).
 
     Yields
@@ -194,9 +195,9 @@ def _perceiving(
 def _blocks(
     views: Iterator[_Item], size: int
 ) -> Iterator[tuple[tuple[FrameRow, ...], tuple[PerceptionInput, ...]]]:
-    """Yield blocks of ``size`` frames, until asked to stop.
+    """Yield blocks of ``size`` frames, until asked to stop; the last one may be shorter.
 
-    The blocks are the same in every run.
+    A resumed run has the same blocks, since segments hold whole blocks.
     """
     while not stopping.asked() and (block := tuple(islice(views, size))):
         rows, perceptions = zip(*block, strict=True)
@@ -213,7 +214,7 @@ def _oriented(work: Work, poses: PoseFinder, skipped: Counter[str]) -> Iterator[
 
     ``skipped`` counts the unreadable frames by reason.
     """
-    source = (_placed(poses, *reading) for reading in _readings(work, skipped))
+    source = (_placed(poses, *reading) for reading in _read_frames(work, skipped))
     for frame, colour, orientation in UpCheck(poses, work.job.settings).before(source):
         yield frame, colour, poses.corrected(frame.topic, orientation)
 
@@ -226,8 +227,11 @@ def _placed(poses: PoseFinder, frame: Frame, colour: ColourView | None) -> Orien
     return frame, view, orientation
 
 
-def _readings(work: Work, skipped: Counter[str]) -> Iterator[tuple[Frame, ColourView | None]]:
-    """Yield the frames of a run, with their colour images or None."""
+def _read_frames(work: Work, skipped: Counter[str]) -> Iterator[tuple[Frame, ColourView | None]]:
+    """Yield the frames of a run, each with its colour image (without pixels) or None.
+
+    ``skipped`` counts the unreadable frames by reason.
+    """
     for frame, colour in frames_with_colour(
         work.recording, work.streams, work.colours, work.job.frame_range, skipped=skipped
     ):

@@ -16,7 +16,7 @@ _JUMP_M = 0.1
 _JUMP_M_S = 2.0
 """Minimum speed of a jump. Cameras of indoor robots are slower."""
 _SUDDEN = 5
-"""A jump is this many times as fast as the motion before and after it."""
+"""A jump is more than this many times as fast as the motion before and after it."""
 
 
 def explain_jumps(folder: Path, fixed_frame: str) -> Iterator[str]:
@@ -25,6 +25,7 @@ def explain_jumps(folder: Path, fixed_frame: str) -> Iterator[str]:
     Parameters
     ----------
     folder : folder with the table of frames.
+    fixed_frame : name of the fixed frame, for the message.
     """
     stamps = read_by_topic(folder, ["stamp_ns"], lambda frames: numbers(frames["stamp_ns"]))
     poses = read_by_topic(folder, ["fixed_translation", "fixed_rotation"], _places)
@@ -43,15 +44,18 @@ def explain_jumps(folder: Path, fixed_frame: str) -> Iterator[str]:
 
 
 def _places(frames: pa.Table) -> F8:
-    """Return the points (n, 3) 1 m in front of the sensor, metres; NaN without a pose."""
+    """Return a point in front of the sensor in each frame (n, 3), fixed frame, metres.
+
+    It is 1 m ahead, so that sudden rotations move it, too; NaN without a pose.
+    """
     turns = numbers_or_nan(frames["fixed_rotation"]).reshape(-1, 3, 3)
     return np.asarray(numbers_or_nan(frames["fixed_translation"]) + turns[:, :, 2])
 
 
 def _jumps(places: F8, stamps_ns: I4) -> tuple[I4, F8]:
-    """Return the indices (k,) of positions (n, 3) before jumps, and the distances (k,), metres.
+    """Return the indices (k,) of the places before jumps, and the distances (k,), metres.
 
-    ``stamps_ns`` (n,) are the times of the positions.
+    ``places`` (n, 3) are from `_places`, in metres, and ``stamps_ns`` (n,) are their times.
     """
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     seconds = np.diff(stamps_ns) * 1e-9

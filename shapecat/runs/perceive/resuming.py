@@ -191,7 +191,14 @@ def _same_recording_and_versions(
 
 
 def _is_complete(folder: Path, run: RunInfo) -> bool:
-    """Return whether *perceive* and *revise* are done, and the tables have the rows counted."""
+    """Return whether *perceive* and *revise* are done, and the tables have as many rows as counted.
+
+    ``run`` is the run.json with the counts.
+
+    Raises
+    ------
+    OutputError : a table is missing or unreadable.
+    """
     counts = run["counts"]
     return (
         {"perceive", "revise"} <= run["seconds"].keys()

@@ -41,9 +41,10 @@ _AROUND_NS = 3_000_000_000
 _FEWEST = 4
 """Minimum number of frames to compare a frame with; with fewer, it is not revised."""
 _STILL_M = 0.03
-"""Largest change of the height of a support below a camera at rest, metres."""
+"""The camera is at rest if the lowest planes of enough nearby frames differ less than this in
+height from their median, metres."""
 _OFF_M = 0.08
-"""Smallest difference between the heights of two supports, metres."""
+"""A frame lacks the usual support if all its planes differ more than this in height, metres."""
 
 
 class Revision(NamedTuple):
@@ -61,10 +62,11 @@ class _Stream(NamedTuple):
 
     Attributes
     ----------
+    frames, stamps_ns : (n,) frame numbers on the topic, and stamps.
     up : (n, 3) up directions in the sensor frame.
     given : (n, 3) up directions from other sources than planes; NaN if there is none.
     rotation : (n, 3, 3) of ``fixed_from_sensor``; NaN if unknown.
-    offsets : plane offsets of each frame along its up direction, ascending, metres.
+    offsets : for each frame, the offsets (p,) of its planes along up, ascending, metres.
     """
 
     frames: I4
@@ -114,9 +116,9 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
 def _fixed_up(stream: _Stream, posed: Bool) -> F8:
     """Return, for each frame, the up direction (n, 3) on which most frames agree.
 
-    ``posed`` (n,) are the frames with a pose. The directions are compared in the fixed frame, and
-    the result is in the sensor frame. It is NaN if the frames do not agree, and for frames without
-    a pose.
+    ``posed`` (n,) is true for frames with a pose. The directions are compared in the fixed frame,
+    and the result is in the sensor frame. It is NaN if the frames do not agree, and for frames
+    without a pose.
     """
     in_fixed = np.einsum("nij,nj->ni", stream.rotation, stream.up)
     agreed = _agreed(in_fixed[posed & stream.has_plane], _OFF_DEG, _FIXED_SHARE)
@@ -147,7 +149,8 @@ def _around(stream: _Stream, k: int) -> I4:
 def _lacks_usual_support(stream: _Stream, off: Bool) -> Bool:
     """Return whether each frame (n,) has no plane at the height of its neighbours' lowest planes.
 
-    The result is False where these disagree or are too few. ``off`` (n,) marks frames to ignore.
+    The result is False where these disagree or are too few. ``off`` (n,) is true for frames to
+    ignore; their result is False.
     """
     is_other = np.zeros(len(off), np.bool_)
     for k in np.flatnonzero(~off):
@@ -162,10 +165,10 @@ def _lacks_usual_support(stream: _Stream, off: Bool) -> Bool:
 
 
 def _agreed(up: F8, within_deg: float, share: float) -> F8:
-    """Return the direction (3,) on which more than ``share`` of the directions agree.
+    """Return the unit vector (3,) on which more than ``share`` of the directions agree.
 
     ``up`` (n, 3) are the directions. Those less than ``within_deg`` from their median agree, and
-    the result is the mean of these; NaN if they are too few, or there are fewer than `_FEWEST`.
+    the result is their mean; NaN if too few agree, or n is less than `_FEWEST`.
     """
     if len(up) < _FEWEST:
         return np.full(3, np.nan)

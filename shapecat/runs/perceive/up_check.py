@@ -40,7 +40,7 @@ Oriented = tuple[Frame, ColourView | None, Orientation]
 
 
 class UpCheck:
-    """Compares the given up direction with the planes in the first frames of each topic."""
+    """Rejects or corrects an up direction that contradicts the planes in a topic's first frames."""
 
     def __init__(self, poses: PoseFinder, settings: Settings) -> None:
         self._poses, self._settings = poses, settings
@@ -72,8 +72,8 @@ class UpCheck:
     def _look(self, frame: Frame, orientation: Orientation) -> None:
         """Compare the up direction of a frame with its planes.
 
-        After enough frames, decide whether the topic has the right up direction. At the first, warn
-        if its clouds are not in the frame of a camera.
+        After enough frames, decide whether the topic has the right up direction. At the first
+        frame of the topic, warn if its clouds are not in the frame of a camera.
         """
         self._looks[frame.topic] += 1
         hint, off = orientation.up, self._off_deg.get(frame.topic, [])

@@ -74,7 +74,8 @@ def explain_up(poses: PoseFinder, folder: Path, report: Mapping[str, Any]) -> It
 def _missing_poses(folder: Path, poses: PoseFinder) -> Iterator[str]:
     """Yield a warning for each topic with frames whose pose in the fixed frame is unknown.
 
-    Without a fixed frame, there is a warning if something moves, since it may be the sensor.
+    Without a fixed frame, all topics get a warning if any transform moves, since their sensors may
+    move with it.
     """
     fixed_frame = poses.fixed_frame
     if fixed_frame is None and poses.transforms.known.moves:
