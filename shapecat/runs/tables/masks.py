@@ -16,12 +16,13 @@ from shapecat.types import ImageMasks, Perception
 __all__ = ["mask_columns", "masks_in", "read_nearest_masks"]
 
 _WITHOUT_COUNTS = MASKS.names[:-1]
+"""The columns of the masks table except the run lengths."""
 _HELD = 256
 """Maximum number of images held back, since a later frame may be nearer to them in time."""
 
 
 def mask_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
-    """Return the columns of the masks table for some frames."""
+    """Return the columns of the masks table, by name, for those frames that have masks."""
     pairs = [(p, p.masks) for p in perceptions if p.masks is not None]
     return {
         "topic": [p.topic for p, _ in pairs],
@@ -41,7 +42,7 @@ def mask_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
 def masks_in(table: pa.Table) -> Iterator[tuple[Key, ImageMasks]]:
     """Yield each frame in a part of the table of masks, and its masks.
 
-    The masks lack run lengths if the part lacks the column ``counts``, which is most of the table.
+    The masks lack run lengths if ``table`` lacks the column ``counts``, the largest by far.
     """
     counts = _run_lengths(table["counts"]) if "counts" in table.column_names else None
     for row in table.select(_WITHOUT_COUNTS).to_pylist():

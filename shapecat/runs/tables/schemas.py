@@ -123,7 +123,8 @@ PLANES = pa.schema(
         ("outline", _FLOATS),
     ]
 )
-"""One row per supporting plane per frame; ``outline`` is x, y, z of each corner in turn."""
+"""One row per supporting plane per frame, with the values of a `Plane`; ``outline`` is x, y, z of
+each corner in turn."""
 
 TRACKS = pa.schema(
     [
