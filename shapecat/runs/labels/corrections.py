@@ -214,7 +214,7 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
 
 
 def correct_label(folder: Path, track: int, label: str, *, previous: str, work: str) -> str:
-    """Set the label of a track of a run, unless it has changed since the caller read it.
+    """Set the label of a track of a run, unless the label has changed since the caller read it.
 
     Parameters
     ----------
@@ -246,7 +246,7 @@ def _valid_labels(
     *,
     one_frame: bool,
 ) -> tuple[tuple[TrackRow, ...], dict[int, str]]:
-    """Return the rows with their new labels, and the reasons for rejected ones, by track.
+    """Return the rows with their new labels, and the reason for each rejected label, by track.
 
     If the labels are not valid together, they are set one by one, merges last.
     """
@@ -312,7 +312,7 @@ def _line_of(problem: str) -> int:
 
 
 def _one_frame(folder: Path) -> bool:
-    """Return whether a run has a fixed frame, so that its sensors share coordinates."""
+    """Return whether a run has a fixed frame for all sensors; False without run.json."""
     return (folder / "run.json").exists() and read_run(folder)["fixed_frame"] is not None
 
 

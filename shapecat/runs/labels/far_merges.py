@@ -22,7 +22,8 @@ _FAR_M = 0.05
 class Gap(NamedTuple):
     """The mean gap between two tracks, the lower number first, over ``frames`` common frames.
 
-    A gap is the distance between their full boxes, or visible ones where full boxes are unknown.
+    A gap is that between their full boxes, or visible ones where full boxes are unknown, and at
+    most their true distance (`_distances`).
     """
 
     tracks: tuple[int, int]
@@ -82,9 +83,10 @@ def _read_gaps(folder: Path, objects: Mapping[int, int]) -> list[Gap]:
 
 
 def _distances(boxes: Sequence[AnnotationBox]) -> F8:
-    """Return the largest gap (n, n) between every two boxes along a face normal of either.
+    """Return the gap between every two boxes, (n, n), metres.
 
-    It is 0 if no face normal separates them, and never more than their true distance.
+    It is the largest gap along a face normal of either box, and 0 if no face normal separates
+    them; never more than their true distance.
     """
     centers = np.array([box.center for box in boxes])
     halves = np.array([box.size for box in boxes]) / 2

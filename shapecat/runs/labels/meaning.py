@@ -25,6 +25,7 @@ __all__ = [
 ]
 
 DELETE = "delete"
+"""The label that removes a track from the final labels."""
 
 _MERGE = re.compile(r"merged? +(?:with|into) +#?(\d{1,9})(?:[.,]0*)?", re.IGNORECASE)
 _INCOMPLETE_MERGE = re.compile(r"merge\D*(\d{1,9})", re.IGNORECASE)
@@ -106,7 +107,8 @@ def resolve_labels(
 
     Parameters
     ----------
-    categories : known categories, besides those in the rows.
+    rows : the lines of a tracks.csv.
+    categories : known categories, besides those in the rows and those of the default model.
     one_frame : whether the topics share a fixed frame, so that tracks of different topics may be
         merged.
 
@@ -173,7 +175,8 @@ def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:
 def _understand(label: str, names: dict[str, str]) -> _Verdict:
     """Interpret a label.
 
-    ``names`` holds the known categories by their names in lower case; a new one is added to it.
+    ``names`` maps the names of known categories in lower case to the names; a new category is added
+    to it.
 
     Raises
     ------
@@ -209,7 +212,9 @@ def _understand(label: str, names: dict[str, str]) -> _Verdict:
 
 
 def is_category_name(name: str) -> bool:
-    """Return whether a text can name a category: neither a command nor a reserved name.
+    """Return whether a text can name a category.
+
+    It follows `NAME_RULE`, and is neither a command, such as ``delete``, nor a reserved name.
 
     Examples
     --------
@@ -221,9 +226,10 @@ def is_category_name(name: str) -> bool:
 
 
 def order_categories(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the distinct ``names`` except `UNKNOWN`: those of the default model come first.
+    """Return the distinct ``names`` except `UNKNOWN`, in a fixed order.
 
-    They are in the order of the model; other names follow in alphabetical order.
+    The categories of the default model come first, in its order; other names follow in
+    alphabetical order.
     """
     distinct = {str(name) for name in names} - {UNKNOWN}
     return (*(name for name in CATEGORIES if name in distinct), *sorted(distinct - set(CATEGORIES)))
@@ -235,9 +241,9 @@ def _without_marks(text: str) -> str:
 
 
 def _nearest(name: str, names: Sequence[str]) -> str | None:
-    """Return the most similar name, or None.
+    """Return the name in ``names`` with the smallest edit distance from ``name``.
 
-    It is at most one edit away if one of the names is short, else at most two.
+    None if the distance is more than 2, or more than 1 if either name is short.
     """
     distances = [(_slips(name, candidate), candidate) for candidate in names]
     slips, candidate = min(distances)

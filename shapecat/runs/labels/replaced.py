@@ -1,4 +1,4 @@
-"""Keep the labels of a run that a new one replaces."""
+"""Keep the labels of a run when a new run replaces it."""
 
 from pathlib import Path
 

@@ -26,7 +26,7 @@ _MOST_REACH_M = 0.10
 _MAJORITY = 0.6
 """Smallest fraction of common frames in which matching tracks are mutual nearest neighbours."""
 _RIVAL = 0.25
-"""A match is ambiguous if another track has at least this fraction."""
+"""A match is ambiguous if another source object matches in at least this fraction of frames."""
 _STILL_M = 0.04
 """Largest scatter of the centres of a small object at rest, seen from several places."""
 _REACH = 0.5
@@ -54,7 +54,10 @@ class Match(NamedTuple):
 
 @dataclass(frozen=True)
 class Matches:
-    """For each track of the source: its matches in the target, or the reason why it has none."""
+    """The matches of source tracks in the target, and the reasons why others have none.
+
+    Both are by source track. A track without either has no detection near it in the target.
+    """
 
     found: Mapping[int, Sequence[Match]]
     reasons: Mapping[int, str]

@@ -29,7 +29,7 @@ class TrackDetections(NamedTuple):
     tracks, frames, detections : (n,) track, frame and detection numbers.
     moments : the `_Moment` of each detection.
     centers : (n, 3) metres, in the fixed frame, or the sensor frame if there is none.
-    rows : the slice of the rows of each `_Moment`.
+    rows : for each `_Moment`, the slice of its detections in the arrays.
     """
 
     tracks: I4
@@ -76,7 +76,9 @@ def _moments(table: pa.Table) -> Iterator[_Moment]:
 
 
 def extents_of(folder: Path, tracks: TrackDetections) -> dict[int, tuple[float, float]]:
-    """Return the larger horizontal size and the largest size of each track: medians, metres.
+    """Return the larger horizontal side and the largest side of each track's median box, metres.
+
+    The median is over up to about `_SAMPLES` visible boxes of the track.
 
     Raises
     ------

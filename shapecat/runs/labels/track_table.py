@@ -40,10 +40,10 @@ _LARGEST_TABLE = 64 << 20
 
 @dataclass(frozen=True)
 class TrackRow:
-    """A line of tracks.csv; ``line`` counts from 1, ``cells`` holds all columns as text.
+    """A line of tracks.csv; ``line`` is its number in the file, from 1.
 
     ``confidence`` is NaN if its cell holds no number from 0 to 1. ``topic`` holds several names,
-    joined by spaces, if the track is in several topics.
+    joined by spaces, if the track is in several topics. ``cells`` holds all columns as text.
     """
 
     line: int
@@ -190,7 +190,7 @@ def _row(line: int, cells: Mapping[str, str]) -> TrackRow | str:
 
 
 def _wrong_numbers(line: int, cells: Mapping[str, str]) -> str:
-    """Return the problem of a line whose track number or confidence is not a number.
+    """Return the problem of a line with an invalid track number or confidence.
 
     ``cells`` holds the cells of the line by column.
     """
@@ -227,7 +227,7 @@ def write_track_table(path: Path, table: TrackTable) -> None:
 
 
 def write_csv(path: Path, lines: Iterable[Iterable[str]]) -> None:
-    """Write lines of cells, with a byte order mark unless they are ASCII.
+    """Write lines of cells as CSV, with a byte order mark unless they are ASCII.
 
     Without the mark, Excel would read and save other letters in the wrong encoding.
     """

@@ -104,8 +104,8 @@ def transfer_labels(source: Path, target: Path) -> Transfer:
 
     Raises
     ------
-    OutputError : one of them is unreadable; or objects must be matched by place, but the two have
-        different fixed frames or none.
+    OutputError : the source or the target is unreadable; or objects must be matched by place, but
+        fixed frames or positions are missing, or the fixed frames differ.
     """
     run = read_run(target)
     transfer = match_labels(source, target)
@@ -221,7 +221,7 @@ def _is_in_its_run(path: Path, table: TrackTable) -> bool:
 
 
 def _groups(labelled: Sequence[TrackRow]) -> Group:
-    """Return a function that maps each track to the one with which it is finally merged."""
+    """Return a function that maps a track to the end of its chain of merges, perhaps itself."""
     partners = {row.track: merged_with(row.label) for row in labelled}
 
     def root(track: int) -> int:
@@ -270,9 +270,9 @@ def _translate(
 
 
 def _why(track: int, whole: int, matches: Matches) -> str:
-    """Return the reason why a track has no match, which is that of its *whole*.
+    """Return the reason why a track has no match, for the user.
 
-    The whole is the track that it is finally merged with, or itself (see `_translate`).
+    It is the reason of ``whole``, the track at the end of its chain of merges.
     """
     reason = matches.reasons.get(whole, "nothing was found there")
     return reason if track == whole else f"track #{whole}, which it is merged with: {reason}"
