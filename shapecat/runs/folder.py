@@ -162,7 +162,8 @@ def _strangers(folder: Path, names: Collection[str]) -> Iterator[Path]:
 def _replace(folder: Path, hidden: Path, marker: Marker, finish: Callable[[], None]) -> None:
     """Replace ``folder`` by the hidden one; at any moment, a complete folder exists.
 
-    First wait for a command that writes outputs in the old folder: it would go on in the new one.
+    First wait for a command that writes outputs in the old folder: it would go on writing in the
+    new one.
     """
     flush(hidden)
     if folder.exists():
@@ -252,10 +253,11 @@ def writing_outputs(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def outputs_pending(folder: Path) -> Iterator[None]:
-    """Mark the outputs of a finished run as missing; after the block, the caller writes them.
+    """Mark the outputs of a finished run as missing while the block changes its labels.
 
-    After a kill, the next run does. After a `ShapecatError` in the block, which then has changed
-    nothing, they count as written again.
+    After the block, the caller writes the outputs; after a kill, processing the recording again
+    writes them. If the block raises a `ShapecatError`, it has changed nothing, and the outputs
+    count as written again.
     """
     run = read_run(folder)
     kept = {phase: s for phase, s in run["seconds"].items() if phase not in OUTPUTS}

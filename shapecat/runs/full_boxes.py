@@ -119,7 +119,7 @@ class FullBoxes:
         return result
 
     def _views(self, seen: "_TrackViews", picked: I4, details: F4) -> BoxViews:
-        """Return the views with the indices ``picked`` (k,) of a track, in the fixed frame.
+        """Return the views with the indices ``picked`` (k,) in ``seen``, in the fixed frame.
 
         ``details`` are their values of `_DETAILS` (k, 3 + `DIRECTIONS`).
         """

@@ -72,7 +72,7 @@ def file_stats(path: Path) -> Stats:
 def unchanged(before: Sequence[Sequence[Any]], path: Path) -> bool:
     """Return whether the files of a recording have the same names, sizes and modification times.
 
-    ``before`` is from `file_stats`.
+    ``before`` is from `file_stats`. The result is False if a file is missing or not accessible.
     """
     try:
         return [list(s[:3]) for s in before] == [s[:3] for s in file_stats(path)]
@@ -106,7 +106,8 @@ def content_digest(path: Path, *, cancelled: Event | None = None) -> str:
 class ContentDigest:
     """The digest of a recording, computed in a thread while the recording is processed.
 
-    The thread also brings the files into the page cache, from which frames are read.
+    Use it as a context manager, which stops the thread. The thread also brings the files into the
+    page cache, from which frames are read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -146,6 +147,10 @@ def same_content(recorded: InputInfo, path: Path, digest: Callable[[], str]) -> 
     """Return whether the content of a recording is that of the entry ``input`` of a run.json.
 
     ``digest`` is called only if the names, sizes or times of the files differ.
+
+    Raises
+    ------
+    OSError : a file is missing or not accessible.
     """
     if recorded["files"] == file_stats(path):
         return True

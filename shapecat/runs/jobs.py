@@ -124,7 +124,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Summary:
-    """A summary of a run.
+    """The outcome of a finished job, for messages and the manifest of a batch.
 
     Attributes
     ----------
@@ -212,7 +212,7 @@ def _words(value: Any) -> str:
 
 
 def add_warnings(run: RunInfo, warnings: Iterable[str]) -> None:
-    """Add warnings to a run, each once."""
+    """Add warnings to a run, each once, in place."""
     run["warnings"] = list(dict.fromkeys([*run["warnings"], *warnings]))
 
 
@@ -228,7 +228,7 @@ def identify(run: RunInfo, content: ContentDigest) -> None:
 
 
 def update_place(run: RunInfo, found: InputInfo) -> bool:
-    """Correct the path of a run's recording if it was moved; return whether it was.
+    """Correct the path of a run's recording, in place, if it was moved; return whether it was.
 
     ``found`` describes the recording at its new path.
     """
@@ -243,7 +243,7 @@ def require_start_in_recording(job: Job, recording: Recording) -> None:
 
     Raises
     ------
-    NoStreamError : it begins after the end.
+    NoStreamError : the range begins after the end of the recording.
     """
     seconds = (recording.end_ns - recording.start_ns) * 1e-9
     start_s = job.frame_range.start_s

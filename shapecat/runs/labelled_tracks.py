@@ -50,7 +50,8 @@ class LabelledTracks:
     detections : (rows,) number of each detection in its frame.
     tracks : (rows,) number of each detection's track, before tracks were merged.
     labels : the final label of each track.
-    last_in : by frame, the tracks that end in it; frames in which none ends are missing.
+    last_in : by frame, the final numbers of the tracks that end in it; frames in which none ends
+        are missing.
     causal : (rows, categories) posterior of each track up to the frame; empty unless requested.
     full : (rows, 10) centre, size (metres) and orientation of the full boxes in the sensor frame;
         NaN if unknown.
@@ -262,7 +263,8 @@ def _in_named_frame(
 def _last_in(frames: Mapping[Key, slice], tracks: I4, stamps_ns: I4) -> dict[Key, tuple[int, ...]]:
     """Return the tracks that end in each frame.
 
-    ``frames`` are the rows of each frame; ``tracks`` and ``stamps_ns`` (n,) are those of the rows.
+    ``frames`` are the rows of each frame; ``tracks`` and ``stamps_ns`` (n,) are the final track
+    number and the stamp of each row.
     Within a topic, the last frame of a track is the one with the highest number, since a clock may
     be set back. If a track is in several topics, it ends in the latest of these frames by stamp.
     """
