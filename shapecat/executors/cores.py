@@ -9,7 +9,7 @@ from pathlib import Path
 __all__ = ["THREAD_LIMITS", "share_cores", "single_threaded", "usable_cores"]
 
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""Environment variables that numeric libraries read when they are loaded."""
+"""Environment variables for the number of threads, which numeric libraries read when loaded."""
 
 
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")

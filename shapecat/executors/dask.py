@@ -1,4 +1,4 @@
-"""Adapter for Dask."""
+"""Adapter for Dask: its client behind the interface of `concurrent.futures`."""
 
 import logging
 from concurrent.futures import Future
@@ -42,7 +42,7 @@ class _DaskExecutor(WorkerExecutor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
-        """Wait for the calls if asked to, and close the client, which cancels the others."""
+        """Wait for the calls if asked to, and close the client, which cancels unfinished calls."""
         if wait and not cancel_futures:
             wait_for(self._futures.copy())
         self._close(_CLOSE_S)
@@ -56,7 +56,7 @@ class _DaskExecutor(WorkerExecutor):
         self._close(1)
 
     def _is_cut_off(self) -> bool:
-        """Return whether the client has given up: it then refuses calls, or never runs them."""
+        """Return whether the client lost the scheduler for good; calls would fail or never run."""
         return self._client.status in {"closing", "closed"}
 
     def _close(self, timeout_s: float) -> None:

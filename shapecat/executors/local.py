@@ -32,7 +32,7 @@ class LocalExecutor(WorkerExecutor):
 
         Parameters
         ----------
-        ahead : number of tasks sent to a busy worker in advance; they fail if it dies.
+        ahead : number of tasks sent to a busy worker in advance; they fail if the worker dies.
 
         Raises
         ------
@@ -129,6 +129,8 @@ class LocalExecutor(WorkerExecutor):
 
     def _worker(self, slot: int, capacity: threading.Semaphore) -> Worker:
         """Return the worker in a slot; start one if there is none or it has died.
+
+        ``capacity`` is as in `Worker`.
 
         Raises
         ------

@@ -73,7 +73,7 @@ class OrderedPool(Generic[_Item, _Result]):
             self._executor.terminate()
 
     def start(self) -> None:
-        """Start the other processes now instead of with the first item: starting takes seconds."""
+        """Start the other processes now, not after the first item: starting takes seconds."""
         if self._others and self._executor is None:
             self._executor = LocalExecutor(self._others, ahead=_SENT_AHEAD)
             for _ in range(self._others):

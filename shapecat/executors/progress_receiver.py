@@ -18,7 +18,7 @@ _SHORT_FOLDER = "/tmp"  # noqa: S108  the folder in it is private
 
 
 class ProgressReceiver:
-    """Passes the messages of `send_progress` to a function, in a thread of its own.
+    """Passes the messages of `send_progress` to a function, in a thread, during a ``with`` block.
 
     A worker that dies while it sends blocks nobody, since there is no lock and no stream. The
     socket is in a folder that only this user may enter.

@@ -46,7 +46,9 @@ class Worker:
     """
 
     def __init__(self, capacity: threading.Semaphore) -> None:
-        """Start a process; each result releases ``capacity``.
+        """Start a process.
+
+        ``capacity`` counts the calls that may still be sent to it; each result releases one.
 
         Raises
         ------

@@ -10,14 +10,14 @@ __all__ = ["COMPILE", "WAIT_FOR_KERNELS", "Observer", "ignore", "kernel_words", 
 _Item = TypeVar("_Item")
 
 Observer = Callable[[str, int, int | None], None]
-"""Called with the phase, the number of items done, and the total (None if unknown)."""
+"""A function called with the phase, the number of items done, and the total (None if unknown)."""
 
 COMPILE, WAIT_FOR_KERNELS = "compile", "wait for kernels"
 """The phases in which this process or another one compiles kernels; the items are kernels."""
 
 
 def ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Ignore the progress."""
+    """Ignore the progress: the `Observer` of callers that do not want it."""
 
 
 def observed(

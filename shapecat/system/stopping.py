@@ -24,7 +24,7 @@ __all__ = [
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _messages = [b"stopping soon; interrupt again to stop immediately\n"]
-"""The last one is printed at the first signal."""
+"""Messages for the first signal; the last of them is printed. `stop_message` adds one."""
 _SHOW_CURSOR = b"\x1b[?25h"
 
 _received: list[int] = []
