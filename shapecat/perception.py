@@ -210,7 +210,7 @@ def _add_masks(given: PerceptionInput, perception: Perception) -> Perception:
 
 
 def _repeats_frame(now: PerceptionInput, then: PerceptionInput, range_m: float) -> bool:
-    """Return whether `shows_the_same` is true of two frames, and their up directions are equal."""
+    """Return whether `shows_the_same` is true, and the given up directions agree or are missing."""
     if (now.up is None) != (then.up is None):
         return False
     if now.up is not None and then.up is not None and now.up @ then.up < _SAME_UP:

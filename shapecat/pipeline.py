@@ -82,8 +82,8 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
 
     Raises
     ------
-    RecordingError, NoStreamError, ModelError, OutputError : as for the command; frames perceived so
-        far are kept.
+    RecordingError, NoStreamError, ModelError, OutputError : the recording, its streams, the model
+        or the run folder cannot be used; frames perceived so far are kept.
     Stopped : a signal asked the process to stop; frames in progress are finished and kept.
     """
     begun = time.perf_counter()
@@ -146,7 +146,7 @@ def _run_phases(work: Work, content: ContentDigest, begun: float) -> None:
 
 
 def _revise_and_warn(work: Work) -> None:
-    """Perceive again the frames that disagree with the rest; warn of problems that cost tracks."""
+    """Perceive again the frames that disagree with the rest; warn about doubtful results."""
     revise(work)
     work.run["warnings"] += explain_doubts(work.recording, work.folder, work.run)
 
@@ -168,7 +168,7 @@ def _run_once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]
 def _add_outputs(
     job: Job, recording: Recording, planned: RunInfo, content: ContentDigest, observe: Observer
 ) -> Summary:
-    """Write the outputs that ``planned`` requests and a complete folder lacks; return its summary.
+    """Write the outputs that ``planned`` requests and a complete run lacks; summarize this run.
 
     Nothing is written if the results are at a URL. The options in ``planned`` change in place.
 

@@ -102,7 +102,10 @@ def _undescribed(candidate: Candidate) -> Detection:
 
 
 def recognize_ball() -> str:
-    """Categorize a synthetic ball and return the category, ``unknown`` if it has no surface."""
+    """Categorize a synthetic ball, which calls the kernels for depth images after detection.
+
+    Return the category, ``unknown`` if the ball has no surface.
+    """
     rng, eye = np.random.default_rng(0), np.array([1, 0, 1], np.float32)
     ways = rng.normal(size=(6000, 3))
     ways /= np.linalg.norm(ways, axis=1)[:, None]
@@ -121,7 +124,11 @@ def recognize_ball() -> str:
 
 
 def find_mask() -> int:
-    """Return the area, pixels, of a square's masks on a registered and an unregistered image."""
+    """Find a square's masks on two colour images, which calls the kernels for colour images.
+
+    One image is registered to the depth image, the other is not. Return the sum of the areas,
+    pixels.
+    """
     frame = _frame_of(np.full((480, 640), 0.7))
     v, u = np.mgrid[200:240, 300:340]
     square = (v * 640 + u).ravel().astype(np.uint32)
@@ -198,9 +205,10 @@ def compile_all(observe: Observer = ignore, *, cores: int = 2, colour: bool = Fa
 
 
 def _completion_marker(*, colour: bool) -> Path | None:
-    """Return the path of a file that exists once all kernels are compiled, with or without colour.
+    """Return the path of a file that exists once all kernels for depth images are compiled.
 
-    The result is None if machine code cannot be stored.
+    With ``colour``, so are those for colour images. The result is None if machine code cannot be
+    stored.
     """
     stages = (*_STAGES, "colour") if colour else _STAGES
     folders = [code_folder(Path(__file__).with_name(stage)) for stage in stages]
@@ -212,7 +220,10 @@ def _completion_marker(*, colour: bool) -> Path | None:
 
 
 def _reporter(observe: Observer) -> Callable[[str], None]:
-    """Return a function that reports a phase and the number of kernels, every ten seconds."""
+    """Return a function that is called often with the phase, and reports it every ten seconds.
+
+    It reports the number of compiled kernels, too.
+    """
     last = time.monotonic()
 
     def report(phase: str) -> None:
