@@ -34,7 +34,7 @@ class WorkerExecutor(Executor):
         """End the workers in the middle of their tasks."""
 
     def stop(self) -> None:
-        """Ask running tasks to stop, and wait until they have; end them if they cannot be asked."""
+        """Ask running tasks to stop, and wait for them; end the workers if that is impossible."""
         self.terminate()
 
     def lacks_workers(self) -> bool:

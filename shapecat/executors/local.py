@@ -74,7 +74,7 @@ class LocalExecutor(WorkerExecutor):
         return task.future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
-        """Let the workers end when all submitted tasks are done."""
+        """Let the workers end when all submitted tasks are done; wait for them by default."""
         self._closed = True
         atexit.unregister(self.terminate)
         if cancel_futures:
@@ -86,7 +86,7 @@ class LocalExecutor(WorkerExecutor):
                 dispatcher.join()
 
     def stop(self) -> None:
-        """Ask running tasks to stop, as a signal would, and wait until they have."""
+        """Ask running tasks to stop, as a signal would, and wait for them."""
         self._end(Worker.ask_to_stop)
 
     def terminate(self) -> None:
