@@ -160,7 +160,7 @@ def _strangers(folder: Path, names: Collection[str]) -> Iterator[Path]:
 
 
 def _replace(folder: Path, hidden: Path, marker: Marker, finish: Callable[[], None]) -> None:
-    """Replace ``folder`` by the hidden one; at any moment, a complete folder exists.
+    """Replace ``folder`` by ``hidden``; a complete folder always exists, if need be a hidden one.
 
     First wait for a command that writes outputs in the old folder: it would go on writing in the
     new one.

@@ -144,7 +144,7 @@ class FullBoxes:
             result[seen.at[block]] = np.hstack([back, size, quaternions, std])
 
     def _read(self, rows: Sequence[I4], values: _Selection) -> list[F4]:
-        """Return, for each track, the values (n, k) in its ``rows`` (n,) of the table."""
+        """Return, for each track, the ``values`` (n, width) of its ``rows`` (n,) of the table."""
         together = np.concatenate([_NO_ROWS, *rows])
         result = np.zeros((len(together), values.width), np.float32)
         with opened(self.table) as file:
@@ -175,7 +175,7 @@ def _split(values: F4, lengths: Sequence[int]) -> list[F4]:
 
 
 def _spread(count: int) -> I4:
-    """Return at most `_MOST_VIEWS` of ``count`` positions, spread evenly from first to last."""
+    """Return the indices of at most `_MOST_VIEWS` of ``count`` views, evenly spread over all."""
     return np.linspace(0, count - 1, min(count, _MOST_VIEWS)).round().astype(np.int64)
 
 

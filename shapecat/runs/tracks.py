@@ -115,7 +115,7 @@ def _write(
 
 
 def _batches(tracks: Iterable[Track]) -> Iterator[list[Track]]:
-    """Yield batches of tracks: one long track, or several short ones. The last may be empty."""
+    """Yield batches of tracks: a long track, or several short ones. The last batch may be empty."""
     batch: list[Track] = []
     for track in tracks:
         if len(track.frames) > _BATCH and batch:

@@ -22,8 +22,8 @@ _FAR_M = 0.05
 class Gap(NamedTuple):
     """The mean gap between two tracks, the lower number first, over ``frames`` common frames.
 
-    A gap is that between their full boxes, or visible ones where full boxes are unknown, and at
-    most their true distance (`_distances`).
+    Gaps are measured between full boxes, or visible boxes where full boxes are unknown, and may be
+    smaller than the true distance (`_distances`).
     """
 
     tracks: tuple[int, int]

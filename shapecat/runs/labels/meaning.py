@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 DELETE = "delete"
-"""The label that removes a track from the final labels."""
+"""The label that deletes a track: the outputs leave it out."""
 
 _MERGE = re.compile(r"merged? +(?:with|into) +#?(\d{1,9})(?:[.,]0*)?", re.IGNORECASE)
 _INCOMPLETE_MERGE = re.compile(r"merge\D*(\d{1,9})", re.IGNORECASE)
@@ -175,8 +175,7 @@ def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:
 def _understand(label: str, names: dict[str, str]) -> _Verdict:
     """Interpret a label.
 
-    ``names`` maps the names of known categories in lower case to the names; a new category is added
-    to it.
+    ``names`` maps lower-case names to the known categories; a new category is added in place.
 
     Raises
     ------

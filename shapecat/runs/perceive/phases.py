@@ -175,7 +175,7 @@ def _perceiving(
             pool.start()
 
         def perceive(views: Iterator[_Item]) -> tuple[int, int]:
-            """Perceive the frames that are not written yet; count all, and those that were."""
+            """Perceive the frames not written yet; count all frames and those written before."""
             count = 0
             for count, _ in enumerate(islice(views, tables.done), start=1):
                 stopping.check()

@@ -154,7 +154,7 @@ def _result_differences(run: RunInfo, planned: RunInfo) -> dict[str, str]:
 
 
 def _with_perceived(planned: RunInfo, run: RunInfo) -> RunInfo:
-    """Return ``planned`` with those entries of ``run`` that perceiving sets."""
+    """Return ``planned`` with the entries of ``run`` that *perceive* and *revise* set."""
     new, counts, seconds = planned.copy(), run["counts"].copy(), run["seconds"]
     counts.pop("tracks", None)
     if "perceive" in seconds:
@@ -183,7 +183,10 @@ def _require_complete(folder: Path) -> None:
 def _same_recording_and_versions(
     run: RunInfo, planned: RunInfo, source: Path, digest: Callable[[], str]
 ) -> bool:
-    """Return whether a run was made by the same versions from the same recording."""
+    """Return whether ``run`` was made from ``source`` by the versions in ``planned``.
+
+    ``digest`` is as in `resume`.
+    """
     if run["versions"] != planned["versions"]:
         return False
     recorded = run["input"]

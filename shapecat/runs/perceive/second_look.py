@@ -25,9 +25,9 @@ from shapecat.runs.tables.reading import (
 __all__ = ["Revision", "frames_to_revise"]
 
 _OFF_DEG = 10.0
-"""A frame is revised if its up direction is off by more than this from that of the recording."""
+"""A frame is revised if its up direction is farther than this from the one expected for it."""
 _AGREES_DEG = 5.0
-"""A frame is not revised if its given up direction is off by less than this."""
+"""A frame is not revised if its given up direction is nearer than this to the expected one."""
 _STILL_SHARE = 0.6
 """The camera is at rest if more than this fraction of the nearby frames agree."""
 _STILL_DEG = 3.0

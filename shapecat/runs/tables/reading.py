@@ -101,6 +101,8 @@ def read_row_groups(
 ) -> Iterator[pa.Table]:
     """Yield the row groups of a table of a run folder, ``at_once`` at a time.
 
+    ``columns`` are the columns to read; None for all.
+
     Raises
     ------
     OutputError : the table is missing or unreadable, or holds values that no run writes.
@@ -261,7 +263,7 @@ def opened(
 
 
 def _validated(table: pa.Table) -> pa.Table:
-    """Check the values in some rows of a table; return them with lists of fixed size.
+    """Check the values in some rows of a table; return the rows with lists of fixed size.
 
     Raises
     ------
@@ -307,7 +309,7 @@ def _open_parquet(path: Path, read_dictionary: Sequence[str]) -> pq.ParquetFile:
 
 
 def _wrong_column(schema: pa.Schema, expected: pa.Schema, columns: Sequence[str] | None) -> str:
-    """Describe the first column that is missing or has an unexpected type; empty if none is."""
+    """Describe the first of ``columns`` that is missing or mistyped; empty if there is none."""
     for field in (field for field in expected if columns is None or field.name in columns):
         if field.name not in schema.names:
             return f"no column {field.name}"
@@ -319,6 +321,6 @@ def _wrong_column(schema: pa.Schema, expected: pa.Schema, columns: Sequence[str]
 
 
 def _file_types(kind: pa.DataType) -> tuple[pa.DataType, ...]:
-    """Return the types that a column may have in a file. Lists need not have a fixed size there."""
+    """Return the types of a column of ``kind`` in a file, where lists may lack a fixed size."""
     is_fixed = pa.types.is_fixed_size_list(kind)
     return (kind, pa.list_(kind.value_type)) if is_fixed else (kind,)

@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 GROUP_FRAMES = 32
-"""Minimum number of frames in a row group."""
+"""Minimum number of frames in a row group, except for the last."""
 _BALANCE = 4096
 """In a table of n frames, row groups have isqrt(n // `_BALANCE`) × `GROUP_FRAMES` frames, but at
 least `GROUP_FRAMES`."""
@@ -58,7 +58,7 @@ def read_segments(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
 
 
 def list_segments(place: Path) -> list[Path]:
-    """Return the complete segments in a folder, in order."""
+    """Return the complete segments in a folder, in the order in which they were written."""
     return sorted(place.glob("[0-9]*"))
 
 
